@@ -59,6 +59,7 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/generate_sync_client.py --check
+	$(BIN)/python scripts/benchmark_page.py --check
 	$(BIN)/python scripts/check_names.py
 
 fix: setup
@@ -66,7 +67,7 @@ fix: setup
 	$(BIN)/ruff check --fix .
 
 bench: setup
-	$(BIN)/python -m benchmarks $(BENCH)
+	$(BIN)/python -m benchmarks $(or $(BENCH),all)
 
 # The documentation as a site, in build/site. Fails on a broken link.
 docs: setup
@@ -74,6 +75,7 @@ docs: setup
 
 generate: setup protocol
 	$(BIN)/python scripts/generate_sync_client.py
+	$(BIN)/python scripts/benchmark_page.py
 
 # The messages of gRPC, in a descriptor pool of their own: a process may hold others of the same names (tritonclient's).
 PROTOCOL := serve_app/inference_protocol

@@ -6,25 +6,22 @@ cost of a request is measured first; the first load needs a third of the target 
 exceeds it.
 """
 
-import argparse
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
+from typing import Any
 
-import yaml
-
-from benchmarks.leagues.served_league import publish
-from benchmarks.load.steps import StepLoad, Steps, stepping
-from benchmarks.processes import replica_processes
+from benchmarks.harness import Quick, Target
+from benchmarks.leagues.served_league import served
+from benchmarks.load.elsewhere import Performance, beside
+from benchmarks.load.steps import Steps, step
 from league.registry.registry import Registry
-from serve_app.runtime.launch import DEPLOY_YAML, running
+from tests.support.servers.processes import replica_processes
+from tests.support.waiting import until
 
-APPEARED, LOST = 10.0, 0
-"""Targets: seconds, calls of our client."""
+APPEARED = 10.0
+"""Seconds."""
 FIRST, FACTOR = 1 / 3, 4
 """The first load as a share of the target load of a replica, and the step."""
 TARGET = 0.6
@@ -51,7 +48,7 @@ class Following:
         started: Seconds from the step up until Ray had started the second replica, which then loads the program.
         appeared: Seconds from the step up to the first answer of the second replica.
         removed: Seconds from the step down until it was gone.
-        seen: What callers saw.
+        record: What callers saw.
     """
 
     rate: float
@@ -59,27 +56,19 @@ class Following:
     started: float
     appeared: float
     removed: float
-    seen: Steps
+    record: Steps
 
 
-def main() -> int:
-    """Print the measurements; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="short phases of constant load")
-    found = follow(5.0 if parser.parse_args().quick else STEADY)
-    seen, rate = found.seen, found.rate
-    print(f"load: {rate:,.0f}, {FACTOR * rate:,.0f}, {rate:,.0f} requests/s, each {1e3 * found.cost:.2f} ms", end="")
-    print(" of processor time")
-    print(f"second replica answers after {found.appeared:.1f} s   (at most {APPEARED:g} s);", end="")
-    print(f" Ray started it after {found.started:.1f} s")
-    print(f"gone {found.removed:.1f} s after the step down, of which {DOWNSCALE_DELAY:g} s are `downscale_delay_s`")
-    print(
-        f"{len(seen.lost)} of {seen.calls:,} calls of the client lost   (at most {LOST}), longest {seen.longest:.2f} s;"
-        f" {sum(seen.statuses.values())} of {seen.attempts:,} single attempts failed {seen.statuses or ''}"
-    )
-    for error in seen.lost:
-        print(f"    {error}")
-    return int(found.appeared > APPEARED or len(seen.lost) > LOST)
+def main(quick: Quick = False) -> Iterator[Target]:
+    """Step the load up and down."""
+    following = follow(5.0 if quick else STEADY)
+    record, rate = following.record, following.rate
+    note = f"{rate:,.0f} to {FACTOR * rate:,.0f} requests/s; Ray started it after {following.started:.1f} s"
+    yield Target("step up: second replica answers", round(following.appeared, 1), "s", at_most=APPEARED, note=note)
+    yield Target("step down: second replica gone", round(following.removed, 1), "s")
+    note = f"of {record.calls:,}, longest {record.longest:.2f} s {'; '.join(record.lost)}".strip()
+    yield Target("calls of the client lost", len(record.lost), at_most=0, note=note)
+    yield Target("single attempts failed", sum(record.statuses.values()), note=f"of {record.attempts:,}")
 
 
 def follow(steady: float, target: float = TARGET, first: float = FIRST, factor: float = FACTOR) -> Following:
@@ -91,51 +80,42 @@ def follow(steady: float, target: float = TARGET, first: float = FIRST, factor: 
     Raises AssertionError if the number of replicas changes under a constant load, and TimeoutError if it does not
     follow a step.
     """
-    with _served(target) as (url, registry):
-        with stepping(url) as load:
+    change = partial(_change, target=target)
+    with served(hidden=HIDDEN, change=change, replicas=1, max_replicas=2) as (url, registry):
+        with beside(step, url) as load:
             cost = _cost(registry, load, max(steady, SHORTEST))
             rate = first * target / cost
-            load.set_rate(rate)
+            load.send(rate)
             _hold(registry, 1, steady)
             up = time.monotonic()
-            load.set_rate(factor * rate)
-            _await(lambda: len(replica_processes(registry.storage.home)), 2)
+            load.send(factor * rate)
+            until(lambda: len(replica_processes(registry.storage.home)) == 2, DEADLINE)
             started = time.monotonic() - up
-            _await(lambda: _replicas(registry), 2)
+            until(lambda: _replicas(registry) == 2, DEADLINE)
             _hold(registry, 2, steady)
             down = time.monotonic()
-            load.set_rate(rate)
-            _await(lambda: _replicas(registry), 1)
+            load.send(rate)
+            until(lambda: _replicas(registry) == 1, DEADLINE)
             removed = time.monotonic() - down
             _hold(registry, 1, steady)
-        appeared, *others = load.seen.since(up)
-        assert not others, "a second replica was added, removed, and added again"
-    return Following(rate, cost, started, appeared, removed, load.seen)
+        appeared, *later = load.result.since(up)
+        assert not later, "a second replica was added, removed, and added again"
+    return Following(rate, cost, started, appeared, removed, load.result)
 
 
-@contextmanager
-def _served(target: float) -> Iterator[tuple[str, Registry]]:
-    """The URL of one or two replicas, and their registry."""
-    document = yaml.safe_load(DEPLOY_YAML.read_text())
+def _change(document: dict[str, Any], target: float) -> None:
     autoscaling = document["applications"][0]["deployments"][0]["autoscaling_config"]
     autoscaling["downscale_delay_s"] = DOWNSCALE_DELAY
     autoscaling["policy"]["policy_kwargs"]["target"] = target
-    with tempfile.TemporaryDirectory() as scratch:
-        registry = publish(Path(scratch) / "home", versions=1, hidden=HIDDEN)
-        deploy = Path(scratch) / "deploy.yaml"
-        deploy.write_text(yaml.safe_dump(document))
-        with running(registry.storage, replicas=1, max_replicas=2, deploy=deploy) as url:
-            yield url, registry
-        registry.close()
 
 
-def _cost(registry: Registry, load: StepLoad, seconds: float) -> float:
+def _cost(registry: Registry, load: Performance[Steps], seconds: float) -> float:
     """Processor time of a request in seconds."""
     (replica,) = replica_processes(registry.storage.home)
-    load.set_rate(SAMPLE)
+    load.send(SAMPLE)
     _busy(replica.cpu_times, seconds / 2)  # after the start, the program still loads what it rarely needs
     once = _busy(replica.cpu_times, seconds)
-    load.set_rate(2 * SAMPLE)
+    load.send(2 * SAMPLE)
     return (_busy(replica.cpu_times, seconds) - once) / SAMPLE
 
 
@@ -161,16 +141,3 @@ def _hold(registry: Registry, number: int, seconds: float) -> None:
     while time.monotonic() < end:
         assert _replicas(registry) == number, f"{_replicas(registry)} replicas under a constant load, not {number}"
         time.sleep(0.05)
-
-
-def _await(replicas: Callable[[], int], number: int) -> None:
-    """Wait for the number of replicas."""
-    deadline = time.monotonic() + DEADLINE
-    while replicas() != number:
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"{replicas()} replicas after {DEADLINE:g} s, not {number}")
-        time.sleep(0.05)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,18 +7,15 @@ machine.
 
 from __future__ import annotations
 
-import argparse
-import math
-import sys
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import binomtest
+from scipy.stats import binom, binomtest
 
-from benchmarks.simulations import coverage, exploiter_gates, golden, null_play, sampled_play
+from benchmarks.harness import Parts, Quick, Target, chosen
+from benchmarks.simulations import coverage, exploiter_gates, null_play, sampled_play
 from benchmarks.simulations.shuffled_order import verdicts_of_shuffled_completion
 from benchmarks.simulations.simulated_gates import CELLS, EQUALS, simulate, stronger
 from benchmarks.simulations.simulated_years import boundary, chance, walk
@@ -34,60 +31,45 @@ CANDIDATES = 8
 SINGLE = GateConfig(elo0=0, elo1=60, max_blocks=1000, nights=None)
 
 
-def gates(quick: bool) -> bool:
+def gates(quick: bool) -> Iterator[Target]:
     """20,000 gates for each hypothesis and three kinds of games."""
-    met = [_simulated(kind, shares, quick) for kind, shares in EQUALS.items()]
-    return all(met)
+    for kind, shares in EQUALS.items():
+        yield from _simulated(kind, shares, 1_000 if quick else 20_000)
 
 
-def _simulated(kind: str, shares: tuple[float, ...], quick: bool) -> bool:
+def _simulated(kind: str, shares: tuple[float, ...], number: int) -> Iterator[Target]:
     """Gates of games with these shares of the cells between equal players."""
-    number = 1_000 if quick else 20_000
     theory = expected_games(SINGLE.elo0, SINGLE.elo1, SINGLE.elo0, SINGLE.alpha, SINGLE.beta)
     null = simulate(SINGLE, np.asarray(shares), number, seed=1)
     better = simulate(SINGLE, stronger(shares, SINGLE.elo1), number, seed=2)
-    false, high = null.promoted.mean(), _high(int(null.promoted.sum()), number)
-    lengths = [2 * float(each.blocks.mean()) / theory for each in (null, better)]
-    print(
-        f"  {kind}: {number} gates at H0: {false:.2%} promoted, upper 95 % bound {high:.2%} (≤ 5 %, ≤ 5.3 %);"
-        f" at H1: {better.promoted.mean():.2%} (≥ 95 %); mean length {lengths[0]:.3f}× and {lengths[1]:.3f}×"
-        f" of the {theory:.0f} games of theory (within 10 %)"
-    )
-    return bool(high <= 0.053 and better.promoted.mean() >= 0.95 and all(abs(each - 1) <= 0.1 for each in lengths))
+    yield _upper(f"{kind}: promoted at H0", int(null.promoted.sum()), number, 5.3)
+    yield Target(f"{kind}: promoted at H1", _percent(better.promoted.mean()), "%", at_least=95.0)
+    lengths = tuple(round(2 * float(gates.blocks.mean()) / theory, 3) for gates in (null, better))
+    yield Target(f"{kind}: length at H0 and H1", lengths, "×", at_least=0.9, at_most=1.1, peer="theory")
 
 
-def years(quick: bool) -> bool:
+def years(quick: bool) -> Iterator[Target]:
     """Years of 365 nights with 8 equally strong candidates, and one that is stronger on night 300."""
-    alpha = alpha_per_verdict(CANDIDATES, 0.05)
-    settings = SINGLE.of_one_verdict(alpha)
+    settings = SINGLE.of_one_verdict(alpha_per_verdict(CANDIDATES, 0.05))
     null, better = (np.asarray(p)[[0, 2, 4]] for p in (EQUALS["decisive"], stronger(EQUALS["decisive"], 60)))
     ends = boundary(settings, [null, better])
-    each = chance(ends, null)
-    exact = 1 - (1 - each) ** (NIGHTS * CANDIDATES)
-    print(f"  alpha of a verdict {alpha:.3g}; chance of its false promotion {each:.3g}, of any in a year {exact:.2%}")
+    exact = 1 - (1 - chance(ends, null)) ** (NIGHTS * CANDIDATES)
+    yield Target("years with a false promotion, exact", _percent(exact), "%", at_most=5.0)
     number, rng = 100 if quick else 1_000, np.random.default_rng(3)
     false = [int(walk(settings, ends, null, NIGHTS * CANDIDATES, rng)[0].sum()) for _ in range(number)]
-    with_any = sum(count > 0 for count in false)
-    low, high = binomtest(with_any, number).proportion_ci(0.95)
-    print(
-        f"  {number} simulated years, {sum(false)} of {number * NIGHTS * CANDIDATES} verdicts false: any in"
-        f" {with_any / number:.2%} [{low:.2%}, {high:.2%}] of years (≤ 5 %)"
-    )
+    note = f"{sum(false)} of {number * NIGHTS * CANDIDATES:,} verdicts"
+    yield Target("years with a false promotion, simulated", _percent(np.mean([*map(bool, false)])), "%", note=note)
     promoted, blocks = walk(settings, ends, better, 20_000, rng)
     anchor = settings.against_anchor(50.0)
     anchored = boundary(anchor, [better])
     passed = [walk(anchor, anchored, better, 20_000, rng) for _ in range(2)]
     both = promoted & passed[0][0] & passed[1][0]
     games = 2 * (blocks + passed[0][1] + passed[1][1])
-    print(
-        f"  night 300, +{settings.elo1:g}: beats the champion {promoted.mean():.2%}, and is not inferior to two earlier"
-        f" champions as strong as that one {both.mean():.2%} (≥ 90 %), in {games.mean():.0f} games on average, 95 %"
-        f" within {np.quantile(games, 0.95):.0f} (at most {2 * settings.max_blocks} a test)"
-    )
-    return exact <= 0.05 and bool(both.mean() >= 0.9)
+    note = f"{games.mean():.0f} games on average, 95 % within {np.quantile(games, 0.95):.0f}"
+    yield Target("better candidate of night 300 promoted", _percent(both.mean()), "%", at_least=90.0, note=note)
 
 
-def traps(quick: bool) -> bool:
+def traps(quick: bool) -> Iterator[Target]:
     """Challengers that beat the champion by 100 Elo and lose to an anchor by 100 Elo more than the margin."""
     number, margin, rng = 100 if quick else 1_000, 50.0, np.random.default_rng(4)
     settings = GateConfig(elo0=0, elo1=30, max_blocks=4000, margin=margin).of_one_verdict(alpha_per_verdict(1, 0.05))
@@ -97,13 +79,13 @@ def traps(quick: bool) -> bool:
     for _ in range(number):
         champion = _decided(settings, against_champion, rng)
         anchor = _decided(settings.against_anchor(settings.margin), against_anchor, rng)
-        seen = combine_results(
+        result = combine_results(
             champion, [AnchorResult(AnchorTest("trap@1", margin, "s"), anchor)], planned_companions=1, forfeits=0
         )
         beaten += champion.outcome == "promote"
-        promoted += seen.outcome == "promote"
-    print(f"  {number} traps: {beaten} beat the champion, {promoted} promoted (0)")
-    return promoted == 0 and beaten > 0.95 * number
+        promoted += result.outcome == "promote"
+    yield Target("non-transitive candidates promoted", promoted, f"of {number}", at_most=0)
+    yield Target("non-transitive candidates that beat the champion", beaten, f"of {number}", at_least=0.95 * number)
 
 
 def _decided(settings: GateConfig, shares: np.ndarray, rng: np.random.Generator) -> Decision:
@@ -113,82 +95,51 @@ def _decided(settings: GateConfig, shares: np.ndarray, rng: np.random.Generator)
     return decision
 
 
-def play(quick: bool) -> bool:
+def play(quick: bool) -> Iterator[Target]:
     """Gates with real games between equally strong versions."""
-    number, met = 20 if quick else 200, True
-    for same, description in (
-        (True, "one policy under two numbers"),
-        (False, "one policy, and the same on a turned board"),
-    ):
+    number = 20 if quick else 200
+    for same, kind in ((True, "one policy under two numbers"), (False, "one policy on a turned board")):
         with tempfile.TemporaryDirectory() as home:
             registry = tictactoe.registry(Path(home), play={"opening_plies": 2, "num_envs": 100})
             promoted = null_play.promoted(registry, same, number)
             registry.close()
-        low, high = binomtest(promoted, number).proportion_ci(0.95)
-        print(
-            f"  {number} gates, {description}: {promoted} promoted, "
-            f"{promoted / number:.1%} [{low:.1%}, {high:.1%}] (≤ 5 %)"
-        )
-        met &= low <= 0.05
-    return met
+        yield _lower(f"real games, {kind}: promoted", promoted, number)
 
 
-def sampled(quick: bool) -> bool:
+def sampled(quick: bool) -> Iterator[Target]:
     """Gates of sampled games: simulated with their exact probabilities, and played."""
-    shares = sampled_play.shares(sampled_play.policy())
-    met = _simulated(f"Kuhn poker, {1 - shares[2]:.1%} of blocks uneven", shares, quick)
+    yield from _simulated("sampled Kuhn poker", sampled_play.shares(sampled_play.policy()), 1_000 if quick else 20_000)
     number = 20 if quick else 200
-    promoted, uneven = sampled_play.promoted(number)
-    low, high = binomtest(promoted, number).proportion_ci(0.95)
-    print(
-        f"  {number} gates, one policy under two numbers, {uneven:.1%} of blocks uneven: {promoted} promoted, "
-        f"{promoted / number:.1%} [{low:.1%}, {high:.1%}] (≤ 5 %)"
-    )
-    return met and bool(low <= 0.05)
+    promoted, _ = sampled_play.promoted(number)
+    yield _lower("real games, sampled Kuhn poker: promoted", promoted, number)
 
 
-def exploiters(quick: bool) -> bool:
+def exploiters(quick: bool) -> Iterator[Target]:
     """Tests against exploiters at the default margin, and intervals of the difference in exploitability."""
-    number, margin, met = 200 if quick else 1_000, SINGLE.margin_against_exploiters, True
+    number, margin = 200 if quick else 1_000, SINGLE.margin_against_exploiters
     settings = SINGLE.model_copy(update={"max_blocks": 4000}).compared_with_champion(margin)
     for pairs in (1, 3):
-        found = {gap: exploiter_gates.simulated(settings, gap, pairs, number) for gap in (0.0, -margin)}
-        wrong = {0.0: ~found[0.0].promoted, -margin: found[-margin].promoted}
-        shares = {gap: float(each.mean()) for gap, each in wrong.items()}
-        lows = {gap: binomtest(int(each.sum()), number).proportion_ci(0.95).low for gap, each in wrong.items()}
-        blocks = {gap: float(each.blocks.mean()) for gap, each in found.items()}
-        print(
-            f"  {pairs} exploiter(s) of each, {number} gates: as exploitable: {shares[0.0]:.2%} refused (≤ 5 %) after"
-            f" {blocks[0.0]:.0f} rounds on average; more by {margin:g}: {shares[-margin]:.2%} passed (≤ 5 %) after"
-            f" {blocks[-margin]:.0f}"
-        )
-        met &= max(lows.values()) <= 0.05
+        equal, worse = (exploiter_gates.simulated(settings, gap, pairs, number) for gap in (0.0, -margin))
+        yield _lower(f"exploiters, {pairs}: equal refused", int((~equal.promoted).sum()), number)
+        yield _lower(f"exploiters, {pairs}: worse passed", int(worse.promoted.sum()), number)
     for spread in (0.0, 0.03, 0.1):
-        rates = {
-            gap: float(exploiter_gates.simulated(settings, gap, 3, number, spread).promoted.mean())
-            for gap in (0.0, -margin)
-        }
+        equal, worse = (exploiter_gates.simulated(settings, gap, 3, number, spread) for gap in (0.0, -margin))
+        wrong = (_percent(1 - equal.promoted.mean()), _percent(worse.promoted.mean()))
+        yield Target(f"exploiters, deviation {spread:g}: equal refused, worse passed", wrong, "%")
         by_block, by_both = exploiter_gates.coverage(number, spread)
-        print(
-            f"  3 exploiters with a standard deviation of {spread:g} between trainings: as exploitable on average:"
-            f" {1 - rates[0.0]:.2%} refused; more by {margin:g}: {rates[-margin]:.2%} passed; 95 % interval over"
-            f" blocks covers {by_block:.2%}, over blocks and exploiters {by_both:.2%} (95 %)"
-        )
-        met &= _high(round(by_both * number), number) >= 0.95
-    return met
+        yield Target(f"exploiters, deviation {spread:g}: coverage over rounds", _percent(by_block), "%")
+        name = f"exploiters, deviation {spread:g}: coverage over rounds and exploiters"
+        least = 100 * binom.ppf(0.025, number, 0.95) / number
+        yield Target(name, _percent(by_both), "%", at_least=round(float(least), 2))
 
 
-AGAINST_ANCHORS = {
-    "as strong as the champion": (0.5, 0.0),
-    "stronger: the champion scores 22 %": (0.22, 0.0),
-    "weaker, and four of five games of candidate and champion are the same": (0.7, 0.8),
-}
-"""Anchor → mean score of the champion against it, and the share of equal games."""
+AGAINST_ANCHORS = {"equal": (0.5, 0.0), "stronger": (0.22, 0.0), "weaker": (0.7, 0.8)}
+"""Strength of an anchor → mean score of the champion against it, and the share of equal games."""
 
 
-def anchors(quick: bool) -> bool:
+def anchors(quick: bool) -> Iterator[Target]:
     """Tests that a candidate does no worse than the champion against an anchor, at the default margin."""
-    margin, met = SINGLE.margin_against_exploiters, True
+    margin = SINGLE.margin_against_exploiters
     for alpha, number in ((0.05, 500 if quick else 5_000), (alpha_per_verdict(1, 0.05), 500 if quick else 20_000)):
         settings = GateConfig().of_one_verdict(alpha).compared_with_champion(margin)
         for anchor, (champion, alike) in AGAINST_ANCHORS.items():
@@ -196,45 +147,36 @@ def anchors(quick: bool) -> bool:
                 exploiter_gates.against_anchor(settings, champion, gap, alike, number, seed)
                 for seed, gap in enumerate((-margin, 0.0, margin / 2), start=21)
             )
-            false, passed = int(worse.promoted.sum()), int(equal.promoted.sum())
-            ends = binomtest(false, number).proportion_ci(0.95)
-            print(
-                f"  α = {alpha:.2g}, anchor {anchor}, {number} tests: worse by {margin:g}: {false / number:.3%} passed"
-                f" [{ends.low:.3%}, {ends.high:.3%}] (≤ {alpha:.3%}); as good: {passed / number:.2%} passed (≥ 95 %)"
-                f" after {equal.blocks.mean():.0f} pairs on average; better by {margin / 2:g}:"
-                f" {better.promoted.mean():.2%} after {better.blocks.mean():.0f}"
-            )
-            met &= ends.low <= alpha and _high(passed, number) >= 0.95
-    return met
+            name = f"anchor, α {alpha:.2g}, {anchor}"
+            yield _lower(f"{name}: worse passed", int(worse.promoted.sum()), number, alpha)
+            passed = _percent(equal.promoted.mean())
+            pairs = f"{equal.blocks.mean():.0f} pairs"
+            note = f"{pairs}; better {better.promoted.mean():.2%}, {better.blocks.mean():.0f} pairs"
+            least = 100 * binom.ppf(0.025, number, 0.95) / number
+            yield Target(f"{name}: as good passed", passed, "%", at_least=round(float(least), 2), note=note)
 
 
-def order(quick: bool) -> bool:
+def order(quick: bool) -> Iterator[Target]:
     """Games whose duration depends on their result, on workers that finish them in any order."""
     number = 100 if quick else 1_000
-    found = verdicts_of_shuffled_completion(number)
-    print(f"  {number} orders of completion, durations by outcome: {len(found)} different verdict(s) (1): {found}")
-    return len(found) == 1
+    verdicts = verdicts_of_shuffled_completion(number)
+    yield Target("verdicts of shuffled orders of completion", len(verdicts), at_most=1, note=f"{number} orders")
 
 
-def intervals(quick: bool) -> bool:
+def intervals(quick: bool) -> Iterator[Target]:
     """Nominal 95 % intervals with a fixed number of blocks."""
-    number, met = 500 if quick else 5_000, True
+    number = 500 if quick else 5_000
     parts: dict[str, Callable[[int, int], float]] = {
-        "Elo, 200 blocks": coverage.elo,
-        "Bradley–Terry ratings, 200 blocks a pair": coverage.rating,
-        "IQM, 40 runs on 5 tasks": coverage.interquartile_mean,
-        "probability of improvement, 40 runs on 5 tasks": coverage.improvement,
+        "Elo": coverage.elo,
+        "Bradley–Terry": coverage.rating,
+        "IQM": coverage.interquartile_mean,
+        "probability of improvement": coverage.improvement,
     }
-    for words, part in parts.items():
-        share = part(number, 5)
-        error = math.sqrt(share * (1 - share) / number)
-        print(f"  {words}: {share:.2%} ± {error:.2%} of {number} simulations covered (94 to 96 %)")
-        met &= 0.94 <= share <= 0.96
-    return met
+    for name, part in parts.items():
+        yield Target(f"coverage of {name}", _percent(part(number, 5)), "%", at_least=94.0, at_most=96.0)
 
 
-PARTS: dict[str, Callable[[bool], bool]] = {
-    "golden": lambda _: golden.run(),
+PARTS: dict[str, Callable[[bool], Iterator[Target]]] = {
     "gates": gates,
     "years": years,
     "traps": traps,
@@ -247,26 +189,23 @@ PARTS: dict[str, Callable[[bool], bool]] = {
 }
 
 
-def main() -> int:
-    """Print each part; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a twentieth of the simulations")
-    parser.add_argument("--only", choices=PARTS, help="one part")
-    options = parser.parse_args()
-    missed = []
-    for name in [options.only] if options.only else PARTS:
-        print(f"{name}:", flush=True)
-        began = time.monotonic()
-        if not PARTS[name](options.quick):
-            missed.append(name)
-        print(f"  ({time.monotonic() - began:.0f} s)", flush=True)
-    print(f"missed: {', '.join(missed) or 'nothing'}")
-    return bool(missed)
+def main(parts: Parts = None, quick: Quick = False) -> Iterator[Target]:
+    """Simulate the parts; a twentieth of the simulations is enough for a smoke test."""
+    for part in chosen(parts, PARTS).values():
+        yield from part(quick)
 
 
-def _high(found: int, number: int) -> float:
-    return float(binomtest(found, number).proportion_ci(0.95).high)
+def _percent(share: float) -> float:
+    return round(100 * float(share), 3)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _upper(name: str, count: int, number: int, most: float) -> Target:
+    """A share whose upper 95 % bound must not exceed a number of percent."""
+    high = _percent(binomtest(count, number).proportion_ci(0.95).high)
+    return Target(f"{name}, upper bound", high, "%", at_most=most, note=f"{count / number:.2%}")
+
+
+def _lower(name: str, count: int, number: int, rate: float = 0.05) -> Target:
+    """A share that must not be significantly above a rate."""
+    most = int(binom.ppf(0.975, number, rate))
+    return Target(name, count, f"of {number:,}", at_most=most, note=f"{count / number:.3%}")

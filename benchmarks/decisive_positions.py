@@ -5,17 +5,17 @@ more, in which some legal moves reach the best outcome and others do not. They a
 the lower limit of Wilson's two-sided 95 % interval. Scripts on the same positions are printed for comparison.
 """
 
-import argparse
-import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from pettingzoo.classic import connect_four_v3
 from scipy.stats import binomtest
 
-from benchmarks.training.learned import report_target
-from league.errors import LeagueError
+from benchmarks.harness import Quick, Target
 from league.policies.line_games.game import CONNECT_FOUR
 from league.policies.line_games.solver import MAX_EMPTY, LineGameSolver
 from league.policies.loading import contestant, pinned
@@ -25,7 +25,7 @@ from league.registry.registry import Registry
 from league.spaces import ACTION_MASK, OBSERVATION
 
 POSITIONS = 500
-KEPT = 0.97
+KEPT = 97.0
 EARLIEST = CONNECT_FOUR.rows * CONNECT_FOUR.columns - MAX_EMPTY
 """Pieces on the board."""
 SCRIPTS = ("script:random", "script:one_ply", "script:minimax_4", "script:mcts_1000")
@@ -50,21 +50,21 @@ class DecisivePositions:
 def decisive_positions(number: int, player: Policy) -> DecisivePositions:
     """Return the first `number` positions. player: moves for both sides."""
     solver, generator = LineGameSolver(CONNECT_FOUR), np.random.default_rng(SEED)
-    found: list[tuple[NDArray, NDArray, NDArray]] = []
-    while len(found) < number:
+    positions: list[tuple[NDArray, NDArray, NDArray]] = []
+    while len(positions) < number:
         late = _late_positions(player, generator)
         for at in generator.permutation(len(late)):
             board, mask = late[at]
             keeping = _keeping(solver, board)
             if keeping.sum() < mask.sum():
-                found.append((board, mask, keeping))
+                positions.append((board, mask, keeping))
                 break
-    return DecisivePositions(*(np.stack(column) for column in zip(*found, strict=True)))
+    return DecisivePositions(*(np.stack(column) for column in zip(*positions, strict=True)))
 
 
 def _late_positions(player: Policy, generator: np.random.Generator) -> list[tuple[NDArray, NDArray]]:
     """Play a game; return its boards and legal actions with at least EARLIEST pieces."""
-    env, found = connect_four_v3.env(), []
+    env, positions = connect_four_v3.env(), []
     env.reset()
     for _ in env.agent_iter():
         observation, _, terminated, truncated, _ = env.last()
@@ -72,11 +72,11 @@ def _late_positions(player: Policy, generator: np.random.Generator) -> list[tupl
             break
         board, mask = observation["observation"].astype(np.int8), observation["action_mask"].astype(np.int8)
         if board.sum() >= EARLIEST:
-            found.append((board, mask))
+            positions.append((board, mask))
         batch = {OBSERVATION: board[np.newaxis], ACTION_MASK: mask[np.newaxis]}
         env.step(int(player.act(batch, rng=[generator]).actions[0]))
     env.close()
-    return found
+    return positions
 
 
 def _keeping(solver: LineGameSolver, board: NDArray) -> NDArray[np.bool_]:
@@ -86,20 +86,9 @@ def _keeping(solver: LineGameSolver, board: NDArray) -> NDArray[np.bool_]:
     return np.array([outcomes.get(action) == best for action in range(CONNECT_FOUR.actions)])
 
 
-def main() -> int:
-    """Print the shares of the scripts and of the version; 1 if the version's is too small."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("ref", nargs="?", default="connect_four@champion", help="default: %(default)s")
-    parser.add_argument("--quick", action="store_true", help="a tenth of the positions")
-    options = parser.parse_args()
-    try:
-        return int(not _measure(options.ref, POSITIONS // 10 if options.quick else POSITIONS))
-    except LeagueError as error:
-        print(error, file=sys.stderr)
-        return 2
-
-
-def _measure(ref: str, number: int) -> bool:
+def main(ref: Annotated[str, typer.Argument()] = "connect_four@champion", quick: Quick = False) -> Iterator[Target]:
+    """The shares of the scripts and of the version."""
+    number = POSITIONS // 10 if quick else POSITIONS
     registry = Registry.open()
     league = CheckpointRef.parse(ref).league
     interface, version = registry.leagues.get(league).interface, pinned(ref, league, registry)
@@ -108,17 +97,10 @@ def _measure(ref: str, number: int) -> bool:
         return next(iter(contestant(name, registry, interface).values()))[1]
 
     positions = decisive_positions(number, policy("script:one_ply"))
-    legal = positions.masks.sum(axis=1)
-    print(
-        f"{number} positions with {EARLIEST} pieces or more; on average {positions.keeping.sum(axis=1).mean():.2f} of"
-        f" {legal.mean():.2f} legal moves keep the outcome"
-    )
+    keeping, legal = positions.keeping.sum(axis=1).mean(), positions.masks.sum(axis=1).mean()
+    print(f"{number} positions; on average {keeping:.2f} of {legal:.2f} legal moves keep the outcome")
     for name in (*SCRIPTS, version):
         kept = positions.kept(policy(name))
         low = binomtest(int(kept.sum()), number).proportion_ci(0.95, "wilson").low
-        print(f"{name}: outcome kept in {kept.mean():.2%} (lower 95 % bound {low:.2%})", flush=True)
-    return report_target(f"{version}: outcome kept in {kept.mean():.2%}", f"{KEPT:.0%}", bool(kept.mean() >= KEPT))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        least = KEPT if name == version else None
+        yield Target(name, round(100 * kept.mean(), 1), "%", at_least=least, note=f"lower bound {low:.2%}")

@@ -6,11 +6,14 @@ counted: one move in a turn-based game, one action of each agent in the others. 
 discrete and half with continuous actions.
 """
 
-import argparse
 import os
-import sys
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from typing import Annotated
 
+import typer
+
+from benchmarks.harness import Quick, Target
 from league.config.environment import EnvironmentConfig
 from league.environments.implementation import VECTORISED, implementation
 from league.environments.vector.equality import Comparison, compare
@@ -24,31 +27,26 @@ KUHN_POKER = EnvironmentConfig(
 )
 
 
-def main() -> int:
-    """Print steps and differences for each environment; 1 if any differ or are not vectorised here."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a hundredth of the steps")
-    parser.add_argument("--processes", type=int, default=os.cpu_count(), help="default: one per core")
-    options = parser.parse_args()
-    cases = [(config, (STEPS // 100 if options.quick else STEPS) // len(kinds)) for kinds in CASES for config in kinds]
-    failed = False
-    with ProcessPoolExecutor(options.processes) as pool:
-        for (config, _), found in zip(cases, pool.map(_compared, *zip(*cases, strict=True)), strict=True):
-            failed |= found.difference is not None
-            kind = " ".join(f"{key}={value}" for key, value in config.kwargs.items())
-            print(
-                f"{config.entry_point:>36} {kind:<24} {found.steps:>9,} steps, {found.episodes:>7,} episodes:"
-                f" {found.difference or '0 differences'}",
-                flush=True,
-            )
-    return int(failed)
+def main(
+    quick: Quick = False,
+    processes: Annotated[int | None, typer.Option(help="default: one per core")] = None,
+) -> Iterator[Target]:
+    """Compare all environments, which must be vectorised here."""
+    cases = [(config, (STEPS // 100 if quick else STEPS) // len(kinds)) for kinds in CASES for config in kinds]
+    with ProcessPoolExecutor(processes or os.cpu_count()) as pool:
+        for (config, _), comparison in zip(cases, pool.map(_compared, *zip(*cases, strict=True)), strict=True):
+            name = " ".join([config.entry_point, *(f"{key}={value}" for key, value in config.kwargs.items())])
+            note = f"{comparison.steps:,} steps, {comparison.episodes:,} episodes"
+            if comparison.difference is not None:
+                note += f": {comparison.difference}"
+            yield Target(name, int(comparison.difference is not None), "differences", at_most=0, note=note)
 
 
 def _compared(config: EnvironmentConfig, steps: int) -> Comparison:
-    chosen = implementation(config)
-    if chosen.vector is None:
-        raise SystemExit(f"{config.entry_point}: {chosen.reason}")
-    return compare(config, chosen.vector(NUM_ENVS, **config.kwargs), steps, SEED)
+    vectorised = implementation(config)
+    if vectorised.vector is None:
+        raise SystemExit(f"{config.entry_point}: {vectorised.reason}")
+    return compare(config, vectorised.vector(NUM_ENVS, **config.kwargs), steps, SEED)
 
 
 def _kinds(entry_point: str) -> list[EnvironmentConfig]:
@@ -59,7 +57,3 @@ def _kinds(entry_point: str) -> list[EnvironmentConfig]:
 
 CASES = [*map(_kinds, VECTORISED), [KUHN_POKER]]
 """Each environment, with its kinds of actions."""
-
-
-if __name__ == "__main__":
-    sys.exit(main())

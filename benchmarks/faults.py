@@ -11,16 +11,13 @@ answered within twice the normal time, and all others with 429 and Retry-After.
 A full disk is simulated by a limit for the processes of the replicas (RLIMIT_FSIZE of 0), with which each write fails.
 """
 
-import argparse
 import os
 import resource
 import shutil
 import signal
 import sqlite3
-import sys
-import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,24 +25,24 @@ from statistics import median
 
 import numpy as np
 
-from benchmarks.leagues.served_league import BODY, LEAGUE, publish
-from benchmarks.load.callers import WITH_RETRIES, WITHOUT_RETRIES, CallLog, calling
+from benchmarks.harness import Parts, Quick, Target, chosen
+from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, promote, served
+from benchmarks.load.callers import WITH_RETRIES, WITHOUT_RETRIES, CallLog, call
+from benchmarks.load.elsewhere import beside
 from benchmarks.load.http import post
-from benchmarks.load.overload import Overload, overload
-from benchmarks.load.slow_clients import slow_clients
-from league.registry.aliases import ANY
+from benchmarks.load.overload import overload
 from league.registry.registry import Registry
-from serve_app.runtime.launch import running
+from tests.support.attacks.slow_clients import slow_clients
+from tests.support.waiting import until
 
 REPLICAS = 2
 SETTLING = 2.0
 """Seconds of calls before a fault, and after recovery."""
 DEADLINE = 90.0
-"""Seconds after which recovery has failed."""
+"""Seconds that a promotion after a kill may take."""
 SLOW = 200
 VICTIMS = ("PolicyServer", "PolicyServer", "PolicyServer", "/haproxy", "ServeController")
 """What is killed before each promotion, in turn."""
-HEADER = ("case", "calls", "lost by our client", "lost without retries", "p99 ms", "recovered after s", "target")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,22 +58,20 @@ class FaultTarget:
         environment.
         """
         home = f"LEAGUE_HOME={self.registry.storage.home}\0".encode()
-        found = []
+        pids = []
         for entry in Path("/proc").iterdir():
             if entry.name.isdigit():
                 with suppress(OSError):
                     first = (entry / "cmdline").read_bytes().split(b"\0")[0]
                     if name.encode() in first and home in (entry / "environ").read_bytes():
-                        found.append(int(entry.name))
-        return found
+                        pids.append(int(entry.name))
+        return pids
 
     def promote(self) -> None:
         """Move the champion to the other version; returns when all replicas serve it."""
-        now = self.registry.aliases.current(LEAGUE)["champion"]
-        self.registry.aliases.set(
-            LEAGUE, "champion", 3 - now, expected=ANY, actor="benchmark", reason="does it follow?"
-        )
-        until(lambda: self.serving(3 - now) == REPLICAS)
+        champion = self.registry.aliases.current(LEAGUE)["champion"]
+        promote(self.registry, 3 - champion)
+        until(lambda: self.serving(3 - champion) == REPLICAS)
 
     def serving(self, version: int) -> int:
         """The number of live replicas that report serving a version."""
@@ -87,80 +82,44 @@ Fault = Callable[[FaultTarget], float]
 """Injects a fault and returns after recovery; the value is the `time.perf_counter` from which recovery was possible."""
 
 
-def main() -> int:
-    """Print a line for each case; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="smoke test: faults of a minute last 5 s")
-    parser.add_argument("--only", choices=[*FAULTS, *LAST], action="append", help="a case; may be repeated")
-    options = parser.parse_args()
-    wanted = options.only or [*FAULTS, *LAST]
-    with tempfile.TemporaryDirectory() as scratch:
-        registry = publish(Path(scratch) / "home", versions=2)
-        print(" | ".join(HEADER), flush=True)
-        with running(registry.storage, replicas=REPLICAS) as url:
-            server = FaultTarget(url, registry, 5.0 if options.quick else 60.0)
-            until(lambda: server.serving(1) == REPLICAS)
-            met = [_report(name, *_inject(server, FAULTS[name], Path(scratch))) for name in FAULTS if name in wanted]
-            if "promotions" in wanted:
-                _report_confirmations(confirmations(server, count=5 if options.quick else 25))
-            if "overload" in wanted:
-                met.append(_report_overload(overload(url, seconds=3.0 if options.quick else 10.0)))
-        registry.close()
-    return int(not all(met))
+def main(parts: Parts = None, quick: Quick = False) -> Iterator[Target]:
+    """Inject the faults in turn."""
+    cases = chosen(parts, {**FAULTS, "promotions": None, "overload": None})
+    with served(2, replicas=REPLICAS) as (url, registry):
+        server = FaultTarget(url, registry, 5.0 if quick else 60.0)
+        until(lambda: server.serving(1) == REPLICAS)
+        for name, fault in cases.items():
+            if fault is not None:
+                yield from _inject(name, server, fault)
+        if "promotions" in cases:
+            seconds = confirmations(server, count=5 if quick else 25)
+            yield Target("promotion right after a kill, median, maximum", (median(seconds), max(seconds)), "s")
+        if "overload" in cases:
+            result = overload(url, seconds=3.0 if quick else 10.0)
+            note = f"{result.p99:.1f} ms; {result.answered:,} of {result.offered:,} answered, the others refused"
+            ratio = result.p99 / result.p99_before
+            yield Target("p99 at four times the capacity", ratio, "×", at_most=2.0, peer="at capacity", note=note)
+            yield Target("overload: neither answered nor 429", result.other, at_most=0)
+            yield Target("overload: 429 without Retry-After", result.without_retry_after, at_most=0)
 
 
-def _inject(server: FaultTarget, fault: Fault, scratch: Path) -> tuple[CallLog, float]:
-    """Inject a fault under load; returns the calls, and the seconds until full recovery."""
-    with calling(server.url, scratch) as log:
+def _inject(name: str, server: FaultTarget, fault: Fault) -> Iterator[Target]:
+    """Inject a fault under load."""
+    with beside(call, server.url) as outcome:
         time.sleep(SETTLING)
         since = fault(server)
         whole = time.perf_counter()
         time.sleep(SETTLING)
+    log: CallLog = outcome.result
+    lost = len(log.failed(WITH_RETRIES))
     last = np.concatenate([[whole], log.failed(WITHOUT_RETRIES), log.failed(WITH_RETRIES)]).max()
-    return log, float(last - since)
-
-
-def _report(name: str, log: CallLog, seconds: float) -> bool:
-    with_retries, without_retries = len(log.failed(WITH_RETRIES)), len(log.failed(WITHOUT_RETRIES))
-    target = "met" if not with_retries else "MISSED (0)"
-    print(
-        f"{name} | {len(log.calls):,} | {with_retries} | {without_retries} | {log.p99(WITH_RETRIES):.1f} "
-        f"| {seconds:.1f} | {target}",
-        flush=True,
-    )
     for error, count in log.errors.items():
         print(f"    {count} × {error}", flush=True)
-    return not with_retries
-
-
-def _report_confirmations(seconds: list[float]) -> None:
-    print(
-        f"{len(seconds)} promotions, each after a kill | confirmed by all replicas after: "
-        f"median {median(seconds):.2f} s, maximum {max(seconds):.2f} s",
-        flush=True,
+    note = (
+        f"of {len(log.calls):,}; {len(log.failed(WITHOUT_RETRIES))} without retries, p99 {log.p99(WITH_RETRIES):.1f} ms"
     )
-
-
-def _report_overload(result: Overload) -> bool:
-    print(
-        f"overload, 4× {result.capacity:,.0f}/s | {result.offered:,} | – | {result.other} | {result.p99:.1f} "
-        f"({result.p99 / result.p99_before:.2f}× of {result.p99_before:.1f}) | – "
-        f"| {'met' if result.is_met else 'MISSED (2×)'}"
-    )
-    print(
-        f"    {result.answered:,} answered, {result.rejected:,} refused with 429, of these "
-        f"{result.without_retry_after} without Retry-After; {result.other} anything else   (at most 0)"
-    )
-    return result.is_met
-
-
-def until(condition: Callable[[], object]) -> None:
-    """Wait for a condition. Raises TimeoutError."""
-    deadline = time.monotonic() + DEADLINE
-    while not condition():
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"the server has not recovered within {DEADLINE:g} s")
-        time.sleep(0.02)
+    yield Target(f"{name}: calls lost by the client", lost, at_most=0, note=note)
+    yield Target(f"{name}: recovery", round(last - since, 1), "s")
 
 
 def _kill(server: FaultTarget, name: str, count: int | None = None) -> float:
@@ -190,15 +149,12 @@ def _confirmation(server: FaultTarget, victim: str) -> float:
     """Kill a process and promote; returns the seconds waited for, when all processes run again."""
     running_before = server.processes(victim)
     os.kill(running_before[0], signal.SIGKILL)
-    now, since = server.registry.aliases.current(LEAGUE)["champion"], time.perf_counter()
-    event = server.registry.aliases.set(
-        LEAGUE, "champion", 3 - now, expected=ANY, actor="benchmark", reason="is it confirmed?"
-    )
-    server.registry.changes.wait_for_alias(event, DEADLINE)
+    champion, since = server.registry.aliases.current(LEAGUE)["champion"], time.perf_counter()
+    server.registry.changes.wait_for_alias(promote(server.registry, 3 - champion), DEADLINE)
     seconds = time.perf_counter() - since
     print(f"    {victim} killed: confirmed after {seconds:.2f} s", flush=True)
     until(lambda: len(set(server.processes(victim)) - {running_before[0]}) >= len(running_before))
-    until(lambda: server.serving(3 - now) == REPLICAS)
+    until(lambda: server.serving(3 - champion) == REPLICAS)
     return seconds
 
 
@@ -215,8 +171,8 @@ def haproxy_killed(server: FaultTarget) -> float:
 
 
 def _has_stand_in(server: FaultTarget) -> bool:
-    found = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in server.processes("/haproxy")]
-    return not found or any(b"standin.cfg" in line for line in found)
+    commands = [Path(f"/proc/{pid}/cmdline").read_bytes() for pid in server.processes("/haproxy")]
+    return not commands or any(b"standin.cfg" in command for command in commands)
 
 
 def manager_killed(server: FaultTarget) -> float:
@@ -277,8 +233,8 @@ def disk_full(server: FaultTarget) -> float:
 
 def artefact_deleted(server: FaultTarget) -> float:
     """The files of the served version, and then a replica is killed as well."""
-    now = server.registry.aliases.current(LEAGUE)["champion"]
-    path = server.registry.artifacts.path(LEAGUE, now)
+    champion = server.registry.aliases.current(LEAGUE)["champion"]
+    path = server.registry.artifacts.path(LEAGUE, champion)
     kept = server.registry.storage.home.with_name("kept")
     shutil.copytree(path, kept)
     shutil.rmtree(path)
@@ -291,8 +247,7 @@ def artefact_deleted(server: FaultTarget) -> float:
 
 def clients_slow(server: FaultTarget) -> float:
     """200 clients that send nothing, or single bytes, while others call."""
-    url = f"{server.url}/v1/policies/{LEAGUE}/action"
-    with slow_clients(server.url, post(url, BODY), SLOW):
+    with slow_clients(server.url, post(server.url + ACTION, BODY), SLOW):
         time.sleep(max(15.0, server.seconds / 2))
     return time.perf_counter()
 
@@ -301,7 +256,6 @@ def _database(server: FaultTarget) -> Path:
     return server.registry.storage.home / "league.db"
 
 
-LAST = ("promotions", "overload")
 FAULTS: dict[str, Fault] = {
     "replica killed": replica_killed,
     "controller killed": controller_killed,
@@ -314,7 +268,3 @@ FAULTS: dict[str, Fault] = {
     "artefact deleted": artefact_deleted,
     "slow clients": clients_slow,
 }
-
-
-if __name__ == "__main__":
-    sys.exit(main())

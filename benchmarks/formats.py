@@ -7,13 +7,9 @@ inference alone in this process. Compared measurements alternate within a round,
 reported.
 """
 
-import argparse
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -22,10 +18,11 @@ import tritonclient.grpc as over_grpc
 import tritonclient.http as over_http
 from numpy.typing import NDArray
 
-from benchmarks.leagues.served_league import BODY, LEAGUE, PLANES, publish
+from benchmarks.harness import CONFIGS, Quick, Target
+from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES, published
 from benchmarks.load import http as load
 from benchmarks.load import websocket as stream_load
-from benchmarks.parity import CONFIGS, prepare, situations
+from benchmarks.parity import prepare, situations
 from benchmarks.training.learned import local_ray
 from league.client.requests import encode
 from league.policies import load as load_policy
@@ -59,96 +56,85 @@ MNIH: dict[str, object] = {
 DATATYPES = {"int8": "INT8", "uint8": "UINT8"}
 
 
-def main() -> int:
-    """Print the measurements; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=4.0)
-    parser.add_argument("--quick", action="store_true", help="smoke test: one short round")
-    options = parser.parse_args()
-    rounds, seconds = (1, 1.0) if options.quick else (options.rounds, options.seconds)
-    with tempfile.TemporaryDirectory() as scratch:
-        registry = publish(Path(scratch) / "home", versions=1)
+def main(quick: Quick = False, rounds: int = 5, seconds: float = 4.0) -> Iterator[Target]:
+    """Measure all formats."""
+    rounds, seconds = (1, 1.0) if quick else (rounds, seconds)
+    with published() as registry:
         with local_ray(1):
             small = prepare(CONFIGS / "pistonball_gpu.yaml", registry, updates=0)
             large = prepare(CONFIGS / "pistonball_gpu.yaml", registry, updates=0, source="parity/2", **MNIH)
         image = _image(registry, large)
         (grpc_port,) = haproxy.free_ports(1, "127.0.0.1")
         with running(registry.storage, replicas=1, grpc_port=grpc_port) as url:
-            met = [
-                _streams(url, rounds, seconds),
-                _batches(url, rounds, seconds),
-                _protocols(url.removeprefix("http://"), f"127.0.0.1:{grpc_port}", rounds, seconds),
-                _images(url, registry, small, image, rounds, seconds, has_target=False),
-                _images(url, registry, large, image, rounds, seconds, has_target=True),
-            ]
-        registry.close()
-    return int(not all(met))
+            yield from _streams(url, rounds, seconds)
+            yield from _batches(url, rounds, seconds)
+            yield from _protocols(url.removeprefix("http://"), f"127.0.0.1:{grpc_port}", rounds, seconds)
+            yield from _images(url, registry, small, image, rounds, seconds, has_target=False)
+            yield from _images(url, registry, large, image, rounds, seconds, has_target=True)
 
 
-def _streams(url: str, rounds: int, seconds: float) -> bool:
-    policy = f"{url}/v1/policies/{LEAGUE}"
+def _stream(url: str, message: bytes, streams: int, seconds: float, is_text: bool = False) -> stream_load.StreamLoad:
+    address = f"{url}/v1/policies/{LEAGUE}/stream"
+    return stream_load.measure(address, message, is_text=is_text, streams=streams, seconds=seconds)
+
+
+def _streams(url: str, rounds: int, seconds: float) -> Iterator[Target]:
     message = encode_request([PLANES[None], np.ones((1, 7), np.int8)], 1)
+    http = "HTTP, JSON"
     measurements: dict[str, Callable[[int], load.Load | stream_load.StreamLoad]] = {
-        "HTTP, JSON": lambda n: load.measure(f"{policy}/action", BODY, connections=n, seconds=seconds),
-        "stream, JSON": lambda n: stream_load.measure(
-            f"{policy}/stream", BODY, is_text=True, streams=n, seconds=seconds
-        ),
-        STREAM: lambda n: stream_load.measure(f"{policy}/stream", message, is_text=False, streams=n, seconds=seconds),
+        http: lambda n: load.measure(url + ACTION, BODY, connections=n, seconds=seconds),
+        "stream, JSON": lambda n: _stream(url, BODY, n, seconds, is_text=True),
+        STREAM: lambda n: _stream(url, message, n, seconds),
     }
     rates: dict[str, list[float]] = {name: [] for name in measurements}
     latencies: dict[str, list[float]] = {name: [] for name in measurements}
     for _ in range(rounds):
         for name, ask in measurements.items():
-            rates[name].append(ask(CONNECTIONS if name.startswith("HTTP") else STREAMS).rate)
+            rates[name].append(ask(CONNECTIONS if name == http else STREAMS).rate)
             latencies[name].append(ask(1).p50)
     for name in measurements:
-        print(f"{name}: {median(rates[name]):,.0f}/s, p50 with one connection {median(latencies[name]):.3f} ms")
-    http, best = "HTTP, JSON", STREAM
-    faster = median(own / other for own, other in zip(rates[best], rates[http], strict=True))
-    sooner = median(own / other for own, other in zip(latencies[best], latencies[http], strict=True))
-    print(f"{best} over {http}, rate: {faster:.2f}×   (at least {FASTER:g}×)")
-    print(f"{best} over {http}, p50: {sooner:.2f}×   (at most {SOONER:g}×)", flush=True)
-    return faster >= FASTER and sooner <= SOONER
+        note = f"p50 with one connection {median(latencies[name]):.3f} ms"
+        yield Target(name, round(median(rates[name])), "actions/s", note=note)
+    faster, sooner = (
+        median(stream / other for stream, other in zip(values[STREAM], values[http], strict=True))
+        for values in (rates, latencies)
+    )
+    yield Target(f"{STREAM}, rate", faster, "×", at_least=FASTER, peer=http)
+    yield Target(f"{STREAM}, p50", sooner, "×", at_most=SOONER, peer=http)
 
 
-def _batches(url: str, rounds: int, seconds: float) -> bool:
+def _batches(url: str, rounds: int, seconds: float) -> Iterator[Target]:
     boards = np.repeat(PLANES[None], BATCH, axis=0)
     body, headers = binary({"observation": boards, "action_mask": np.ones((BATCH, 7), np.int8)})
     infer = f"{url}/v2/models/{LEAGUE}/infer"
     message = encode_request([boards, np.ones((BATCH, 7), np.int8)], BATCH)
-    rest, stream = [], []
+    over_rest, stream = [], []
     for _ in range(rounds):
-        rest.append(load.measure(infer, body, connections=4, seconds=seconds, headers=headers).rate * BATCH)
-        streamed = stream_load.measure(
-            f"{url}/v1/policies/{LEAGUE}/stream", message, is_text=False, streams=4, seconds=seconds
-        )
-        stream.append(streamed.rate * BATCH)
-    print(f"batches of {BATCH}, REST binary: {median(rest):,.0f} actions/s   (at least {ACTIONS:,})")
-    print(f"batches of {BATCH}, stream, binary: {median(stream):,.0f} actions/s", flush=True)
-    return median(rest) >= ACTIONS
+        over_rest.append(load.measure(infer, body, connections=4, seconds=seconds, headers=headers).rate * BATCH)
+        stream.append(_stream(url, message, 4, seconds).rate * BATCH)
+    yield Target(f"batches of {BATCH}, REST binary", round(median(over_rest)), "actions/s", at_least=ACTIONS)
+    yield Target(f"batches of {BATCH}, {STREAM}", round(median(stream)), "actions/s")
 
 
-def _protocols(rest: str, grpc: str, rounds: int, seconds: float) -> bool:
+def _protocols(rest: str, grpc: str, rounds: int, seconds: float) -> Iterator[Target]:
     for rows in (1, BATCH):
-        texts = []
+        medians = []
         for module, address in ((over_http, rest), (over_grpc, grpc)):
             with module.InferenceServerClient(address) as client:
                 inputs = _inputs(module, rows)
                 times = [_p50(lambda c=client, i=inputs: c.infer(LEAGUE, i), seconds) for _ in range(rounds)]
-            texts.append(median(times))
-        print(f"tritonclient, {rows} rows: REST binary {texts[0]:.2f} ms, gRPC {texts[1]:.2f} ms", end="")
-        print(f", gRPC over REST: {texts[1] / texts[0]:.2f}×", flush=True)
-    return True
+            medians.append(median(times))
+        note = f"{medians[1]:.2f} to {medians[0]:.2f} ms"
+        yield Target(f"gRPC by tritonclient, rows: {rows}", medians[1] / medians[0], "×", peer="REST binary", note=note)
 
 
 def _inputs(module: object, rows: int) -> list[object]:
     arrays = {"observation": np.repeat(PLANES[None], rows, axis=0), "action_mask": np.ones((rows, 7), np.int8)}
     inputs = []
     for name, array in arrays.items():
-        given = module.InferInput(name, list(array.shape), "INT8")  # type: ignore[attr-defined]
-        given.set_data_from_numpy(array)
-        inputs.append(given)
+        tensor = module.InferInput(name, list(array.shape), "INT8")  # type: ignore[attr-defined]
+        tensor.set_data_from_numpy(array)
+        inputs.append(tensor)
     return inputs
 
 
@@ -157,9 +143,9 @@ def _p50(call: Callable[[], object], seconds: float) -> float:
     for _ in range(20):
         call()
     times, stop = [], time.perf_counter() + seconds
-    while (now := time.perf_counter()) < stop:
+    while (moment := time.perf_counter()) < stop:
         call()
-        times.append(time.perf_counter() - now)
+        times.append(time.perf_counter() - moment)
     return median(times) * 1e3
 
 
@@ -172,7 +158,7 @@ class _Form:
 
 def _images(
     url: str, registry: Registry, version: VersionRow, image: NDArray, rounds: int, seconds: float, has_target: bool
-) -> bool:
+) -> Iterator[Target]:
     """One image in each format, with one connection. has_target: whether the target applies to this network."""
     policy = load_policy(version.ref, None, registry)
     body, headers = binary({"observation": image[None]})
@@ -190,26 +176,22 @@ def _images(
     for _ in range(rounds):
         inference.append(_p50(lambda: policy.act({"observation": image[None]}), seconds))
         for name, form in forms.items():
-            seen = load.measure(url + form.path, form.body, connections=1, seconds=seconds, headers=form.headers)
-            assert not seen.failed, f"{name}: {seen.statuses}"
-            times[name].append(seen.p50)
+            result = load.measure(url + form.path, form.body, connections=1, seconds=seconds, headers=form.headers)
+            assert not result.failed, f"{name}: {result.statuses}"
+            times[name].append(result.p50)
         answered = stream_load.measure(streamed, message, is_text=False, streams=1, seconds=seconds)
         assert not answered.failures
         times[STREAM].append(answered.p50)
     alone = median(inference)
     sizes = {name: len(form.body) for name, form in forms.items()} | {STREAM: len(message)}
-    print(f"a picture of {image.shape}, network of {_megabytes(registry, version):.1f} MB, ", end="")
-    print(f"inference alone: {alone:.2f} ms")
-    for name, taken in times.items():
-        share = alone / median(taken)
-        print(f"{name}: {sizes[name]:,} bytes, p50 {median(taken):.2f} ms, inference {share:.0%} of it")
-    met = True
+    network = f"image, network of {_megabytes(registry, version):.1f} MB"
+    for name, p50 in times.items():
+        note = f"{sizes[name]:,} bytes; inference alone {alone:.2f} ms"
+        yield Target(f"{network}, {name}", round(median(p50), 2), "ms", note=note)
     for name in ("binary", STREAM):
-        beside = median(own / other for own, other in zip(times[name], inference, strict=True))
-        limit = f"   (at most {BESIDE_INFERENCE:g}×)" if has_target and name == "binary" else ""
-        print(f"{name} over inference alone: {beside:.2f}×{limit}", flush=True)
-        met = met and not (limit and beside > BESIDE_INFERENCE)
-    return met
+        ratio = median(served / bare for served, bare in zip(times[name], inference, strict=True))
+        most = BESIDE_INFERENCE if has_target and name == "binary" else None
+        yield Target(f"{network}, {name}", ratio, "×", at_most=most, peer="inference alone")
 
 
 def _megabytes(registry: Registry, version: VersionRow) -> float:
@@ -238,15 +220,11 @@ def binary(arrays: Mapping[str, NDArray], outputs: Sequence[str] = ("action",)) 
         }
         for name, array in arrays.items()
     ]
-    has_target = [{"name": name, "parameters": {"binary_data": True}} for name in outputs]
-    head = orjson.dumps({"inputs": inputs, "outputs": has_target})
+    wanted_outputs = [{"name": name, "parameters": {"binary_data": True}} for name in outputs]
+    head = orjson.dumps({"inputs": inputs, "outputs": wanted_outputs})
     body = head + b"".join(array.tobytes() for array in arrays.values())
     return body, BINARY | {"Inference-Header-Content-Length": str(len(head))}
 
 
 def _document(observation: object) -> bytes:
     return orjson.dumps({"observation": observation})
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,18 +5,20 @@ until it answers. Target: 10 minutes, of which training takes at most 5. Then pl
 scripts (`benchmarks.strength`).
 """
 
-import argparse
 import os
 import signal
 import subprocess
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import httpx
 
-ROOT = Path(__file__).parent.parent
+from benchmarks.harness import ROOT, Quick, Target
+
 TARGET = 600.0
 TRAINING_TARGET = 300.0
 OBSERVATION = {"observation": [[[0, 0]] * 7] * 6, "action_mask": [1] * 7}
@@ -29,30 +31,20 @@ PHASES = (
 """The phase that has ended when a line with this text appears."""
 
 
-def main() -> None:
-    """Print the seconds of each phase, and the total as a fraction of the target."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--port", type=int, default=8000)
-    parser.add_argument("--quick", action="store_true", help="smoke test: half a minute of training")
-    options = parser.parse_args()
+def main(quick: Quick = False, port: int = 8000) -> Iterator[Target]:
+    """Time each phase."""
     with tempfile.TemporaryDirectory(prefix="policy-league-") as folder:
         clone = Path(folder) / "policy-league"
         subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
-        arguments = f"--exit --port {options.port}" + (" --minutes 0.5" if options.quick else "")
-        print("fresh clone, then: make demo", flush=True)
-        marks, answered = _run(clone, arguments, f"http://127.0.0.1:{options.port}")
+        arguments = f"--exit --port {port}" + (" --minutes 0.5" if quick else "")
+        marks, answered = _run(clone, arguments, f"http://127.0.0.1:{port}")
         print("\nthe champion of this demo:", flush=True)
-        strength = [".venv/bin/python", "-m", "benchmarks.strength", "--hold", "demo"]
+        strength = [".venv/bin/python", "-m", "benchmarks", "strength", "--hold", "demo"]
         subprocess.run(strength, cwd=clone, env=_environment(clone))
-        print()
-    previous = 0.0
-    for phase, _ in PHASES:
-        if phase in marks:
-            print(f"{phase:>10}: {marks[phase] - previous:6.1f} s")
-            previous = marks[phase]
-    training = marks["training"] - marks["set-up"]
-    print(f"training / 300 s: {training / TRAINING_TARGET:.2f}   (at most 1)")
-    print(f"promoted endpoint answers after {answered:.1f} s; / 600 s: {answered / TARGET:.2f}   (at most 1)")
+    for before, phase in pairwise(("start", *(phase for phase, _ in PHASES if phase in marks))):
+        limit = TRAINING_TARGET if phase == "training" else None
+        yield Target(phase, round(marks[phase] - marks.get(before, 0.0), 1), "s", at_most=limit)
+    yield Target("promoted endpoint answers", round(answered, 1), "s", at_most=TARGET)
 
 
 def _run(clone: Path, arguments: str, url: str) -> tuple[dict[str, float], float]:
@@ -104,7 +96,3 @@ def _answer(url: str, start: float, demo: "subprocess.Popen[str]") -> float:
             pass
         time.sleep(0.5)
     raise RuntimeError("the demo ended before the champion answered")
-
-
-if __name__ == "__main__":
-    main()

@@ -4,25 +4,22 @@ For each configuration: seconds of sampling and of learning per 1,000 actions, a
 the CPU. All is done in one process, with four threads, after the first updates.
 """
 
-import argparse
-import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 
+from benchmarks.harness import CONFIGS, Parts, Quick, Target, chosen
 from benchmarks.training.learned import local_ray
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.metrics import PHASES, totals
 from training.runs.trial import MAX_THREADS, build_algorithm
 
-CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 SAMPLING, LEARNING, _ = PHASES
 VARIANTS: dict[str, dict[str, float]] = {
     "CPU": {},
@@ -54,11 +51,11 @@ def cost(league: LeagueConfig, seconds: float) -> Cost:
     """Train for some seconds after the first updates, which include compilation and the filling of a replay buffer."""
     algorithm = build_algorithm(league, interface(league))
     try:
-        begun = time.perf_counter()
-        while time.perf_counter() - begun < seconds / 3:
+        began = time.perf_counter()
+        while time.perf_counter() - began < seconds / 3:
             algorithm.train()
-        sums, thousands, begun = Counter[str](), 0.0, time.perf_counter()
-        while (elapsed := time.perf_counter() - begun) < seconds:
+        sums, thousands, began = Counter[str](), 0.0, time.perf_counter()
+        while (elapsed := time.perf_counter() - began) < seconds:
             result = algorithm.train()
             sums.update(totals(result))
             thousands += result[ENV_RUNNER_RESULTS][NUM_ENV_STEPS_SAMPLED] / 1000
@@ -67,35 +64,24 @@ def cost(league: LeagueConfig, seconds: float) -> Cost:
         algorithm.stop()
 
 
-def measure(part: str, seconds: float) -> None:
-    """Print the row of each variant of one configuration, with its ratio to the CPU."""
+def measure(part: str, seconds: float) -> Iterator[Target]:
+    """Measure each variant of one configuration."""
     name, settings = PARTS[part]
     league = LeagueConfig.load(CONFIGS / f"{name}.yaml").with_training(**settings, runners=0)
     costs = {variant: cost(league.with_training(**gpus), seconds) for variant, gpus in VARIANTS.items()}
-    for variant, found in costs.items():
-        ratio = found.total / costs["CPU"].total
-        print(f"| {part} | {variant} | {found.sampling:.3f} | {found.learning:.3f} | {ratio:.2f}× |", flush=True)
+    for variant, seconds_per_thousand in costs.items():
+        ratio = seconds_per_thousand.total / costs["CPU"].total
+        note = f"sampling {seconds_per_thousand.sampling:.3f} s, learning {seconds_per_thousand.learning:.3f} s"
+        yield Target(f"{part}, {variant}", round(ratio, 2), "×", note=note)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure the requested configurations; without a GPU, nothing is measured."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
-    parser.add_argument("--quick", action="store_true", help="a few seconds each")
-    given = parser.parse_args(arguments)
-    if unknown := [part for part in given.parts if part not in PARTS]:
-        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
+def main(parts: Parts = None, quick: Quick = False) -> Iterator[Target]:
+    """Measure the configurations; without a GPU, nothing is measured."""
     if not torch.cuda.is_available():
         print("skipped: torch finds no GPU")
-        return 0
+        return
     torch.set_num_threads(MAX_THREADS)
     print(f"{torch.cuda.get_device_name()}, {torch.get_num_threads()} threads, torch {torch.__version__}")
-    print("| configuration | variant | sampling | learning | time |")
     with local_ray(cpus=2):
-        for part in given.parts or PARTS:
-            measure(part, 2.0 if given.quick else 8.0)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        for part in chosen(parts, PARTS):
+            yield from measure(part, 2.0 if quick else 8.0)

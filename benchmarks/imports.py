@@ -7,10 +7,8 @@ and by a running server. Target: no action differs on 10,000 observations; near 
 is left out if it is not installed.
 """
 
-import argparse
-import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.harness import CONFIGS, Quick, Target
 from benchmarks.peers.foreign_models import (
     ForeignModel,
     mapped_graph,
@@ -42,7 +41,6 @@ from training.importing.checks import collect
 from training.importing.open_source import open_sources
 from training.importing.publish import publish
 
-CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 OBSERVATIONS = 10_000
 ROWS = 256
 """Observations of one request."""
@@ -61,10 +59,6 @@ class Compared:
     endpoint_differs: int
     different_actions: int
     """Number of actions that the source chose at least once."""
-
-    @property
-    def is_equal(self) -> bool:
-        return self.graph_differs == self.endpoint_differs == 0 and self.different_actions > 1
 
 
 def prepare(directory: Path) -> list[ForeignModel]:
@@ -132,27 +126,17 @@ def _answer(
 
 def _parts(observations: Mapping[str, NDArray]) -> list[dict[str, NDArray]]:
     count = len(next(iter(observations.values())))
-    return [{name: each[at : at + ROWS] for name, each in observations.items()} for at in range(0, count, ROWS)]
+    return [{name: array[at : at + ROWS] for name, array in observations.items()} for at in range(0, count, ROWS)]
 
 
-def main() -> int:
-    """Print each model; 1 if an action differs."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="compare 500 observations of each model")
-    observations = 500 if parser.parse_args().quick else OBSERVATIONS
+def main(quick: Quick = False) -> Iterator[Target]:
+    """Compare each model."""
     with tempfile.TemporaryDirectory() as scratch:
         models = prepare(Path(scratch))
-        compared = compare_all(models, Storage.at(Path(scratch) / "home"), observations)
-    print(f"{'model':>24} {'version':>16} {'observations':>13} {'graph differs':>14} {'endpoint differs':>17}")
-    for each in compared:
-        print(
-            f"{each.name:>24} {each.ref:>16} {each.observations:>13,} {each.graph_differs:>14,}"
-            f" {each.endpoint_differs:>17,}"
-        )
-    is_met = all(each.is_equal for each in compared)
-    print(f"imported models act as their sources: {'met' if is_met else 'MISSED'}")
-    return int(not is_met)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        storage = Storage.at(Path(scratch) / "home")
+        for model in compare_all(models, storage, 500 if quick else OBSERVATIONS):
+            differences = (model.graph_differs, model.endpoint_differs)
+            note = f"of {model.observations:,}"
+            yield Target(f"{model.name}: graph, endpoint", differences, "differ", at_most=0, note=note)
+            # A model that always acts alike would prove nothing.
+            yield Target(f"{model.name}: different actions", model.different_actions, at_least=2)

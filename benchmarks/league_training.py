@@ -10,30 +10,29 @@
   `--minutes` and `--seeds` measure less.
 """
 
-import argparse
 import io
 import math
 import statistics
-import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+import typer
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.core.columns import Columns
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from rich.console import Console
 
+from benchmarks.harness import CONFIGS, Parts, Quick, Target, chosen
 from benchmarks.training.league_arms import MINUTES, compare_arms
 from benchmarks.training.league_arms import SEEDS as CONNECT_FOUR_SEEDS
-from benchmarks.training.learned import local_ray, one_thread, report_target, updates
+from benchmarks.training.learned import local_ray, one_thread, updates
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
@@ -47,7 +46,6 @@ from training.export.publish import Checkpoint, publish
 from training.runs.train import train
 from training.runs.trial import build_algorithm
 
-CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 OVERHEAD = 1.3
 """Maximum ratio of the times per action."""
 SEEDS = range(5)
@@ -73,8 +71,8 @@ BLOTTO_TRAINING = {"runners": 0, "hidden": [32], "train_batch_size": 2048, "lr":
 """Of all arms. At the default rate, a million actions do not make self-play exploitable."""
 
 
-def overhead(quick: bool) -> bool:
-    """Print the times per action with both kinds of opponents."""
+def overhead(quick: bool) -> Iterator[Target]:
+    """The times per action with both kinds of opponents."""
     versions, rounds, updates = (4, 3, 4) if quick else (8, 7, 10)
     config = LeagueConfig.load(CONFIGS / "connect_four.yaml")
     config = config.with_training(runners=0, minutes=None, steps=4096 * versions, checkpoint_every=4096)
@@ -97,12 +95,10 @@ def overhead(quick: bool) -> bool:
                 times[name].append(update_times(algorithm, updates))
         for algorithm in arms.values():
             algorithm.stop()
-    met = True
-    for number, part in enumerate(("sampling and learning", "sampling alone")):
-        own, league = (statistics.median(each[number] for each in times[name]) for name in ("self-play", "league"))
-        print(f"overhead, {part}: {own:.1f} µs per action in self-play, {league:.1f} µs with opponents")
-        met &= report_target(f"overhead, {part}: {league / own:.2f}×", f"{OVERHEAD}×", league <= OVERHEAD * own)
-    return met
+    medians = {name: [statistics.median(column) for column in zip(*rows, strict=True)] for name, rows in times.items()}
+    for part, alone, league in zip(("overhead", "overhead of sampling"), *medians.values(), strict=True):
+        note = f"{league:.1f} to {alone:.1f} µs per action"
+        yield Target(part, round(league / alone, 2), "×", at_most=OVERHEAD, peer="self-play", note=note)
 
 
 def update_times(algorithm: Algorithm, updates: int) -> tuple[float, float]:
@@ -115,27 +111,24 @@ def update_times(algorithm: Algorithm, updates: int) -> tuple[float, float]:
     return 1e6 * (time.perf_counter() - began) / actions, 1e6 * sampling / actions
 
 
-def blotto(quick: bool) -> bool:
-    """Print the exploitability of all arms and seeds."""
-    steps = 100_000 if quick else 1_000_000
-    means: dict[tuple[str, str], float] = {}
-    met = True
+def blotto(quick: bool) -> Iterator[Target]:
+    """The exploitability of all arms and seeds."""
+    third = math.inf
     for arm, settings in ARMS.items():
-        found: dict[str, list[float]] = {"last": [], "nash": [], "average": []}
+        values: dict[str, list[float]] = {"last": [], "nash": [], "average": []}
         for seed in SEEDS:
-            policies = trained(settings, seed, steps)
+            policies = trained(settings, seed, 100_000 if quick else 1_000_000)
             payoff = policies @ PAYOFF @ policies.T
-            found["last"].append(exploitability(policies[-1]))
-            found["nash"].append(exploitability(nash_averaging(payoff)[0] @ policies))
-            found["average"].append(exploitability(policies[len(policies) // 2 :].mean(axis=0)))
-        for name, values in found.items():
-            means[arm, name] = statistics.mean(values)
-            print(f"blotto, {arm}, {name}: {means[arm, name]:.3f} ({_each(values)})", flush=True)
-        if arm in LESS_EXPLOITABLE:
-            kind = LESS_EXPLOITABLE[arm]
-            mean, third = means[arm, kind], means["self-play", "last"] / 3
-            met &= report_target(f"blotto, {arm}, {kind}: {mean:.3f}", f"{third:.3f}", mean <= third)
-    return met
+            values["last"].append(exploitability(policies[-1]))
+            values["nash"].append(exploitability(nash_averaging(payoff)[0] @ policies))
+            values["average"].append(exploitability(policies[len(policies) // 2 :].mean(axis=0)))
+        for kind, of_seeds in values.items():
+            mean = round(statistics.mean(of_seeds), 3)
+            if (arm, kind) == ("self-play", "last"):
+                third = mean / 3
+            limit = round(third, 3) if LESS_EXPLOITABLE.get(arm) == kind else None
+            note = ", ".join(f"{value:.3f}" for value in of_seeds)
+            yield Target(f"blotto, {arm}, {kind}", mean, at_most=limit, note=note)
 
 
 def trained(settings: dict[str, Any], seed: int, steps: int) -> NDArray[np.float64]:
@@ -177,35 +170,19 @@ def _probabilities(algorithm: LeagueAlgorithm) -> NDArray[np.float64]:
     return np.asarray(output[Columns.ACTION_DIST_INPUTS][0].double().softmax(-1))
 
 
-def _each(values: Any) -> str:
-    return ", ".join(f"{value:.3f}" for value in values)
-
-
-def connect_four(quick: bool, minutes: float = MINUTES, seeds: Sequence[int] = CONNECT_FOUR_SEEDS) -> bool:
-    """Compare both arms after a budget for each; see `compare_arms`."""
-    return compare_arms(minutes / 10 if quick else minutes, seeds)
-
-
-PARTS = {"overhead": overhead, "blotto": blotto, "connect_four": connect_four}
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the requested parts; 1 if a target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
-    parser.add_argument("--quick", action="store_true", help="a tenth of the time")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="of an arm of connect_four; default: 28")
-    parser.add_argument("--seeds", type=int, nargs="+", default=CONNECT_FOUR_SEEDS, help="of connect_four")
-    given = parser.parse_args(arguments)
-    if unknown := [part for part in given.parts if part not in PARTS]:
-        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
-    parts = PARTS | {"connect_four": partial(connect_four, minutes=given.minutes, seeds=given.seeds)}
+def main(
+    parts: Parts = None,
+    quick: Quick = False,
+    minutes: Annotated[float, typer.Option(help="of an arm of connect_four")] = MINUTES,
+    seeds: Annotated[list[int] | None, typer.Option(help="of connect_four; default: 0, 1, 2")] = None,
+) -> Iterator[Target]:
+    """Measure the parts."""
+    cases: dict[str, Callable[[], Iterator[Target]]] = {
+        "overhead": lambda: overhead(quick),
+        "blotto": lambda: blotto(quick),
+        "connect_four": lambda: compare_arms(minutes / 10 if quick else minutes, seeds or CONNECT_FOUR_SEEDS),
+    }
     one_thread()
     with local_ray(cpus=2):
-        missed = [name for name in given.parts or parts if not parts[name](given.quick)]
-    print(f"\nmissed: {', '.join(missed)}" if missed else "\nall met")
-    return bool(missed)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        for part in chosen(parts, cases).values():
+            yield from part()

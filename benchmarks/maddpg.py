@@ -6,24 +6,22 @@ A finished seed is not trained again: its policies are kept in `--directory`. Al
 agent and episode.
 """
 
-import argparse
 import json
-import multiprocessing
-import sys
 import time
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
 from scipy import stats
 
-from benchmarks.training.learned import local_ray, one_thread
+from benchmarks.harness import CONFIGS, Quick, Target
+from benchmarks.training.learned import local_ray, one_thread, two_at_once
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.maddpg import MADDPG
@@ -31,7 +29,7 @@ from training.algorithms.setup import algorithm_config
 from training.runs.trial import build_algorithm
 from training.sampling.replay_runner import ActorRunner
 
-CONFIG = Path(__file__).parent.parent / "policy_league/configs" / "simple_adversary.yaml"
+CONFIG = CONFIGS / "simple_adversary.yaml"
 CRITICS = {"MADDPG": "centralised", "DDPG": "own"}
 ADVERSARY, GOOD = "adversary", "good_0"
 """Policies of the two sides; the two good agents have equal rewards."""
@@ -39,16 +37,6 @@ AGENTS = 3
 BAND = "MAPPO of MARLlib after 20M steps: good agent +8.0 … +10.6, adversary −14.9 … −17.1"
 POINTS = 10
 """Number of points of the printed curve."""
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The command-line options. directory: where trained policies are kept."""
-
-    minutes: float
-    seeds: int
-    episodes: int
-    directory: Path
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,26 +119,31 @@ def learning_curve(algorithm: MADDPG, seconds: float) -> list[dict[str, float]]:
     return curve
 
 
-def cross_play(options: Options) -> bool:
-    """Four cells: the adversaries of each algorithm against the good sides of each."""
+def main(
+    quick: Quick = False,
+    minutes: Annotated[float, typer.Option(help="of each training")] = 20.0,
+    seeds: Annotated[int, typer.Option(help="of each algorithm")] = 5,
+    episodes: Annotated[int, typer.Option(help="of each pair in cross-play")] = 400,
+    directory: Annotated[Path, typer.Option(help="of trained policies")] = Path("build/benchmarks/maddpg"),
+) -> Iterator[Target]:
+    """Train, and play the adversaries of each algorithm against the good sides of each: four cells."""
+    if quick:
+        minutes, seeds, episodes = 0.5, 2, 50
     jobs = {
-        name: [TrainingJob(critic, seed, options.minutes, options.directory) for seed in range(options.seeds)]
+        name: [TrainingJob(critic, seed, minutes, directory) for seed in range(seeds)]
         for name, critic in CRITICS.items()
     }
     # Seeds of both algorithms run side by side, so that both have the same share of the machine.
-    queue = [job for pair in zip(*jobs.values(), strict=True) for job in pair]
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
-        list(pool.map(train, queue))
-    trained = {name: [Trained.load(job.file) for job in own] for name, own in jobs.items()}
-    for name, seeds in trained.items():
-        for seed, each in enumerate(seeds):
-            print_seed(name, seed, each)
+    list(two_at_once(train, [job for pair in zip(*jobs.values(), strict=True) for job in pair]))
+    trained = {name: [Trained.load(job.file) for job in of_algorithm] for name, of_algorithm in jobs.items()}
+    for name, versions in trained.items():
+        for seed, version in enumerate(versions):
+            print_seed(name, seed, version)
     with local_ray(cpus=1):
         one_thread()
-        cells, random = matrix(trained, options.episodes)
-    print(f"\nall at random: good agent {random[1]:.2f}, adversary {random[0]:.2f}. {BAND}")
-    return report_cells(cells)
+        cells, random = matrix(trained, episodes)
+    print(f"all at random: good agent {random[1]:.2f}, adversary {random[0]:.2f}. {BAND}")
+    yield from compare(cells)
 
 
 Cells = dict[tuple[str, str], NDArray]
@@ -168,10 +161,10 @@ def matrix(trained: dict[str, list[Trained]], episodes: int) -> tuple[Cells, tup
     runner = ActorRunner(config=algorithm_config(league, described), worker_index=0)
     random = means(runner.sample(num_episodes=10 * episodes, random_actions=True))
     cells: Cells = {}
-    for own, adversaries in trained.items():
-        for other, goods in trained.items():
+    for name, adversaries in trained.items():
+        for of_good, goods in trained.items():
             pairs = [[play(runner, left, right, episodes) for right in goods] for left in adversaries]
-            cells[own, other] = np.array(pairs)
+            cells[name, of_good] = np.array(pairs)
     runner.stop()
     return cells, random
 
@@ -204,24 +197,19 @@ def print_seed(name: str, seed: int, trained: Trained) -> None:
     print("  " + "  ".join(f"{point[ADVERSARY]:.1f}/{point[GOOD]:+.1f}" for point in summary["curve"]))
 
 
-def report_cells(cells: Cells) -> bool:
-    """Print the cells, and the advantage of MADDPG's good side. Each seed counts once, by its mean over the others."""
-    print(f"\n{'adversary of':>14} {'good side of':>14} {'good agent':>28} {'adversary':>28}   (95 % over seeds)")
-    for (own, other), cell in cells.items():
-        good, adversary = cell[:, :, 1].mean(axis=0), cell[:, :, 0].mean(axis=1)
-        print(f"{own:>14} {other:>14} {format_mean(good):>28} {format_mean(adversary):>28}")
-        print(f"{'':>30} of each good side: {', '.join(f'{value:.2f}' for value in good)}")
-    met = True
-    for own in CRITICS:
-        ours, theirs = (cells[own, other][:, :, 1].mean(axis=0) for other in CRITICS)
+def compare(cells: Cells) -> Iterator[Target]:
+    """The cells, and the advantage of MADDPG's good side. Each seed counts once, by its mean over the others."""
+    for (adversary, good), cell in cells.items():
+        returns, against = cell[:, :, 1].mean(axis=0), cell[:, :, 0].mean(axis=1)
+        name = f"good agent of {good} against adversaries of {adversary}"
+        note = f"each {', '.join(f'{value:.2f}' for value in returns)}; adversary {format_mean(against)}"
+        yield Target(name, round(float(returns.mean()), 2), note=note)
+    for adversary in CRITICS:
+        ours, theirs = (cells[adversary, good][:, :, 1].mean(axis=0) for good in CRITICS)
         low, high = difference(ours, theirs)
-        met &= low > 0
-        print(
-            f"MADDPG's good side against the adversaries of {own}: better by {ours.mean() - theirs.mean():.2f},"
-            f" 95 % interval {low:.2f} … {high:.2f} (target: above 0)"
-        )
-    print(f"MADDPG's good side better against both: {'met' if met else 'MISSED'}", flush=True)
-    return met
+        note = f"{ours.mean() - theirs.mean():.2f}, at most {high:.2f}"
+        name = f"advantage of MADDPG's good side, lower bound, adversaries of {adversary}"
+        yield Target(name, round(low, 2), at_least=0.0, note=note)
 
 
 def format_mean(values: NDArray) -> str:
@@ -238,23 +226,3 @@ def difference(first: NDArray, second: NDArray) -> tuple[float, float]:
         return float("-inf"), float("inf")
     interval = stats.ttest_ind(first, second, equal_var=False).confidence_interval(0.95)
     return float(interval.low), float(interval.high)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Train, play and report; 1 if the target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=20.0, help="minutes of each training (20)")
-    parser.add_argument("--seeds", type=int, default=5, help="seeds of each algorithm (5)")
-    parser.add_argument("--episodes", type=int, default=400, help="episodes of each pair in cross-play (400)")
-    parser.add_argument(
-        "--directory", type=Path, default=Path("build/benchmarks/maddpg"), help="directory of trained policies"
-    )
-    parser.add_argument("--quick", action="store_true", help="two seeds of half a minute")
-    given = parser.parse_args(arguments)
-    if given.quick:
-        given.minutes, given.seeds, given.episodes = 0.5, 2, 50
-    return int(not cross_play(Options(given.minutes, given.seeds, given.episodes, given.directory)))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

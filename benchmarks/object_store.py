@@ -6,7 +6,6 @@ state; a proxy counts the bytes that it receives. Further loads read the cache, 
 loads of the same version from a directory.
 """
 
-import argparse
 import os
 import random
 import shutil
@@ -16,12 +15,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
 
 from benchmarks.footprint import LARGE
+from benchmarks.harness import Quick, Target
 from benchmarks.leagues.served_league import LEAGUE, builder, fill
 from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest
@@ -58,21 +58,15 @@ registry.publisher.publish(league, build, source=source)
 """
 
 
-def main() -> int:
-    """Print the measurements; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="smoke test: few kills, a small training state")
-    quick = parser.parse_args().quick
+def main(quick: Quick = False) -> Iterator[Target]:
+    """Kill publishers, and load versions."""
     with object_store.server() as endpoint, tempfile.TemporaryDirectory() as name:
         os.environ |= object_store.variables(endpoint)
-        met = [
-            _kills(Path(name) / "kills", object_store.create_bucket(endpoint), 5 if quick else KILLS),
-            _loads(Path(name) / "loads", endpoint, 20 if quick else TRAINING_STATE),
-        ]
-    return int(not all(met))
+        yield _kills(Path(name) / "kills", object_store.create_bucket(endpoint), 5 if quick else KILLS)
+        yield from _loads(Path(name) / "loads", endpoint, 20 if quick else TRAINING_STATE)
 
 
-def _kills(home: Path, url: str, times: int) -> bool:
+def _kills(home: Path, url: str, times: int) -> Target:
     registry = fill(_registry(home, url), 1, LARGE)
     files, delays = _prepared(registry, home / "prepared"), random.Random(0)
     for i in range(times):
@@ -87,10 +81,8 @@ def _kills(home: Path, url: str, times: int) -> bool:
         publisher.stdout.close()
     visible = registry.versions.all(LEAGUE)
     partial = sum(not _is_complete(registry, version.number) for version in visible)
-    ready = len(visible) - 1
-    print(f"{times} publishers killed, {times - ready} before their version was ready: ", end="")
-    print(f"{partial} partial versions visible   (0)", flush=True)
-    return partial == 0
+    note = f"{times - len(visible) + 1} of {times} publishers killed before their version was ready"
+    return Target("partial versions visible", partial, at_most=0, note=note)
 
 
 def _is_complete(registry: Registry, number: int) -> bool:
@@ -110,7 +102,7 @@ def _prepared(registry: Registry, target: Path) -> Path:
     return target
 
 
-def _loads(home: Path, endpoint: str, megabytes: int) -> bool:
+def _loads(home: Path, endpoint: str, megabytes: int) -> Iterator[Target]:
     url = object_store.create_bucket(endpoint)
     versions = fill(_registry(home / "publisher", url), 1, LARGE)
     number = versions.publisher.publish(LEAGUE, _with_training(versions, megabytes), source="large").number
@@ -126,11 +118,13 @@ def _loads(home: Path, endpoint: str, megabytes: int) -> bool:
     os.environ |= object_store.variables(endpoint)
     directory = fill(Registry.open(Storage.at(home / "directory")), 1, LARGE)
     local = _times(lambda: load(directory, LEAGUE, 1, INLINE, ActionSelections()))
-    print(f"bytes received for a version with {megabytes} MB of training state: {received:.2f} MB", end="")
-    print(f"   (at most {TO_TRANSFER:g}); for the cached loads {again:.2f} MB")
-    print(f"cached load of 1 MB with ONNX Runtime and warm-up: median {_shown(cached)}", end="")
-    print(f"   (at most {TO_READ:g} ms); from a directory {_shown(local)}", flush=True)
-    return received <= TO_TRANSFER and median(taken for taken, _ in cached) <= TO_READ
+    note = f"training state of {megabytes} MB; cached loads {again:.2f} MB"
+    yield Target("received for a version of 1 MB", round(received, 2), "MB", at_most=TO_TRANSFER, note=note)
+    (wall, cpu), (of_directory, _) = (
+        [median(column) for column in zip(*rows, strict=True)] for rows in (cached, local)
+    )
+    note = f"{cpu:.1f} ms of processor time; from a directory {of_directory:.1f} ms"
+    yield Target("cached load with warm-up", round(wall, 1), "ms", at_most=TO_READ, note=note)
 
 
 def _with_training(registry: Registry, megabytes: int) -> Callable[[Path, int], Manifest]:
@@ -150,17 +144,12 @@ def _registry(home: Path, url: str) -> Registry:
 
 def _times(function: Callable[[], object], times: int = 20) -> list[tuple[float, float]]:
     """Time and processor time of calls in milliseconds."""
-    taken = []
+    durations = []
     for _ in range(times):
         start, cpu = time.perf_counter(), time.process_time()
         function()
-        taken.append(((time.perf_counter() - start) * 1e3, (time.process_time() - cpu) * 1e3))
-    return taken
-
-
-def _shown(times: list[tuple[float, float]]) -> str:
-    taken, cpu = (median(column) for column in zip(*times, strict=True))
-    return f"{taken:.1f} ms, {cpu:.1f} ms of processor time"
+        durations.append(((time.perf_counter() - start) * 1e3, (time.process_time() - cpu) * 1e3))
+    return durations
 
 
 class CountingProxy:
@@ -188,7 +177,3 @@ class CountingProxy:
                     self.received += len(data)
                 target.sendall(data)
             target.shutdown(socket.SHUT_WR)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,24 +6,25 @@ cache; and the rate of the action route while a page of the league is open, divi
 pairs of runs, of which the median counts.
 """
 
-import argparse
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from statistics import median
+from typing import Annotated
 
 import httpx
 import numpy as np
+import typer
 from playwright.sync_api import Browser, sync_playwright
 
-from benchmarks.crowded_league import LEAGUE, crowd
-from benchmarks.leagues.served_league import BODY
+from benchmarks.harness import Quick, Target
+from benchmarks.leagues.served_league import ACTION, BODY
 from benchmarks.load.http import measure
 from serve_app.runtime.launch import running
+from tests.support.leagues.crowded_league import LEAGUE, crowd
 
 CALL = 100
 """Maximum 95th percentile of the requests of each call, in milliseconds."""
@@ -39,43 +40,38 @@ PAGES = ("", "/payoff", "/versions", "/verdicts", "/history", "/matches", "/eval
 """Paths relative to the page of the league."""
 
 
-def main() -> int:
-    """Print the measurements; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--times", type=int, default=50, help="repetitions of each call")
-    parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--quick", action="store_true", help="smoke test: a small league, once")
-    options = parser.parse_args()
-    times, pairs, seconds = (5, 1, 2.0) if options.quick else (options.times, options.pairs, options.seconds)
+def main(
+    quick: Quick = False,
+    times: Annotated[int, typer.Option(help="repetitions of each call")] = 50,
+    pairs: int = 5,
+    seconds: float = 8.0,
+) -> Iterator[Target]:
+    """Measure calls, pages, and actions beside a page."""
+    times, pairs, seconds = (5, 1, 2.0) if quick else (times, pairs, seconds)
     with tempfile.TemporaryDirectory() as scratch:
         home = Path(scratch) / "home"
-        registry = crowd(home, versions=20, matches=5000) if options.quick else crowd(home)
+        registry = crowd(home, versions=20, matches=5000) if quick else crowd(home)
         registry.close()
         with running(registry.storage, replicas=1) as url:
-            slowest = _calls(url, times)
+            yield _calls(url, times)
             with _browser() as browser:
-                paint = max(
-                    _paint(browser, url, path) for path in ("/", *(f"/leagues/{LEAGUE}{page}" for page in PAGES))
-                )
-                ratio = median(_pair(browser, url, seconds, bool(number % 2)) for number in range(pairs))
-    print(f"\nslowest call, 95 %: {slowest:.0f} ms   (at most {CALL} ms)")
-    print(f"slowest first contentful paint: {paint:.0f} ms   (at most {PAINT} ms)")
-    print(f"actions with a page open over without: {ratio:.2f}×   (at least {RATE:g}×)")
-    return int(slowest > CALL or paint > PAINT or ratio < RATE)
+                paints = [_paint(browser, url, path) for path in ("/", *(f"/leagues/{LEAGUE}{page}" for page in PAGES))]
+                yield Target("first contentful paint of the pages", (min(paints), max(paints)), "ms", at_most=PAINT)
+                ratios = [_pair(browser, url, seconds, bool(number % 2)) for number in range(pairs)]
+                note = f"pairs {', '.join(f'{ratio:.2f}' for ratio in ratios)}"
+                yield Target("actions beside an open page", median(ratios), "×", RATE, peer="without", note=note)
 
 
-def _calls(url: str, times: int) -> float:
-    """Time each call; returns the largest 95th percentile in milliseconds."""
-    found = []
+def _calls(url: str, times: int) -> Target:
+    """Time each call."""
+    slowest = []
     with httpx.Client(base_url=url, timeout=30) as client:
         for path in _paths(client):
             _timed(client, path)
-            took = [_timed(client, path) for _ in range(times)]
-            p50, p95 = np.percentile(took, [50, 95])
-            found.append(float(p95))
+            p50, p95 = np.percentile([_timed(client, path) for _ in range(times)], [50, 95])
+            slowest.append(float(p95))
             print(f"{p50:6.1f} {p95:6.1f} ms   GET {path}", flush=True)
-    return max(found)
+    return Target(f"slowest 95th percentile of {len(slowest)} calls", round(max(slowest)), "ms", at_most=CALL)
 
 
 def _timed(client: httpx.Client, path: str) -> float:
@@ -129,7 +125,7 @@ def _paint(browser: Browser, url: str, path: str) -> float:
     page = context.new_page()
     page.goto(url + path)
     entry = page.wait_for_function("performance.getEntriesByName('first-contentful-paint')[0]?.startTime")
-    painted = float(entry.json_value())
+    painted = round(float(entry.json_value()))
     context.close()
     print(f"{painted:6.0f} ms   first contentful paint of {path}", flush=True)
     return painted
@@ -140,12 +136,10 @@ def _pair(browser: Browser, url: str, seconds: float, is_even: bool) -> float:
     rates = {}
     for is_watched in (is_even, not is_even):
         with _watching(browser, url) if is_watched else nullcontext():
-            load = measure(f"{url}/v1/policies/{LEAGUE}/action", BODY, connections=CONNECTIONS, seconds=seconds)
+            load = measure(url + ACTION, BODY, connections=CONNECTIONS, seconds=seconds)
         assert not load.failed, "an action was not answered"
         rates[is_watched] = load.rate
-    ratio = rates[True] / rates[False]
-    print(f"{rates[False]:,.0f}/s, with a page open {rates[True]:,.0f}/s: {ratio:.2f}×", flush=True)
-    return ratio
+    return rates[True] / rates[False]
 
 
 @contextmanager
@@ -158,7 +152,3 @@ def _watching(browser: Browser, url: str) -> Iterator[None]:
     page.get_by_role("table").first.wait_for()
     yield
     context.close()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,16 +7,15 @@ graph chose the other one of two actions whose logits differ by less than 1e-5, 
 summation. Target: all others are equal.
 """
 
-import argparse
-import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from benchmarks.harness import CONFIGS, Quick, Target
 from benchmarks.training.learned import local_ray
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -38,7 +37,6 @@ from training.export.publish import Checkpoint, load_modules, publish
 from training.modules.policy_module import PolicyModule
 from training.runs.trial import build_algorithm
 
-CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 OBSERVATIONS = 10_000
 BODY = 3 << 18
 """Bytes of observations in a request: a number takes about four characters in JSON, and the body size is limited."""
@@ -111,28 +109,28 @@ def situations(
     config: LeagueConfig, league_interface: Interface, modules: Mapping[str, PolicyModule], limit: int
 ) -> dict[str, list[ObservedBatch]]:
     """Policy → batches from play, with exactly `limit` observations in total."""
-    found: dict[str, list[ObservedBatch]] = {policy: [] for policy in modules}
+    observed: dict[str, list[ObservedBatch]] = {policy: [] for policy in modules}
     seed = 0
-    while any(sum(map(len, batches)) < limit for batches in found.values()):
+    while any(sum(map(len, batches)) < limit for batches in observed.values()):
         for policy, batches in collect_observations(config.environment, league_interface, modules, seed).items():
-            found[policy] += batches
+            observed[policy] += batches
         seed += 1
-    return {policy: list(_first(batches, limit)) for policy, batches in found.items()}
+    return {policy: list(_first(batches, limit)) for policy, batches in observed.items()}
 
 
 def _first(batches: Sequence[ObservedBatch], limit: int) -> Sequence[ObservedBatch]:
-    chosen = []
+    first = []
     for batch in batches:
         rows = slice(0, min(len(batch), limit))
-        chosen.append(
+        first.append(
             ObservedBatch(
                 *({name: array[rows] for name, array in part.items()} for part in (batch.observations, batch.state))
             )
         )
-        limit -= len(chosen[-1])
+        limit -= len(first[-1])
         if not limit:
             break
-    return chosen
+    return first
 
 
 def _compare(
@@ -143,7 +141,7 @@ def _compare(
         dist_inputs, _ = module_outputs(module, batch)
         expected = to_environment(module.distribution.mode(torch.from_numpy(dist_inputs)).numpy(), space)
         state = {f"{STATE_IN}{i}": value for i, value in enumerate(batch.state.values())} or None
-        by_graph, by_endpoint = (each.act(batch.observations, state=state).actions for each in (graph, endpoint))
+        by_graph, by_endpoint = (player.act(batch.observations, state=state).actions for player in (graph, endpoint))
         wrong, tied = count_differences(by_graph, expected, dist_inputs, space)
         count, graph_differs, ties = count + len(batch), graph_differs + wrong, ties + tied
         endpoint_differs += count_differences(by_endpoint, expected, dist_inputs, space)[0]
@@ -167,31 +165,16 @@ def _joined(batches: Sequence[ObservedBatch]) -> list[ObservedBatch]:
     ]
 
 
-def main() -> int:
-    """Print each policy of each configuration; 1 if one acts differently."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="500 observations of each policy")
-    observations = 500 if parser.parse_args().quick else OBSERVATIONS
+def main(quick: Quick = False) -> Iterator[Target]:
+    """Compare each policy of each configuration."""
     with tempfile.TemporaryDirectory() as home:
         registry = Registry.open(Storage.at(Path(home)))
         with local_ray(cpus=2):
             versions = [prepare(path, registry, updates=2) for path in sorted(CONFIGS.glob("*.yaml"))]
-        print(f"{'policy':>26} {'observations':>13} {'near ties':>10} {'graph differs':>14} {'endpoint differs':>17}")
         with running(registry.storage) as url:
-            equal = [_report(version, compare(version, registry, url, observations)) for version in versions]
-    print(f"module, graph and endpoint act alike: {'met' if all(equal) else 'MISSED'}")
-    return int(not all(equal))
-
-
-def _report(version: VersionRow, compared: Sequence[Compared]) -> bool:
-    for each in compared:
-        print(
-            f"{version.league + '.' + each.policy:>26} {each.observations:>13,} {each.near_ties:>10,}"
-            f" {each.graph_differs:>14,} {each.endpoint_differs:>17,}",
-            flush=True,
-        )
-    return all(each.equal for each in compared)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            for version in versions:
+                for policy in compare(version, registry, url, 500 if quick else OBSERVATIONS):
+                    differences = (policy.graph_differs, policy.endpoint_differs)
+                    note = f"of {policy.observations:,}, {policy.near_ties:,} near ties"
+                    name = f"{version.league}.{policy.policy}: graph, endpoint"
+                    yield Target(name, differences, "differ", at_most=0, note=note)

@@ -6,27 +6,26 @@ itself. The server also counts the requests at the edges of the windows: a small
 Target: all runs succeed, no request fails, and the counts differ by at most 5 %.
 """
 
-import argparse
 import json
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.leagues.served_league import LEAGUE, PLANES, publish
+from benchmarks.harness import Quick, Target
+from benchmarks.leagues.served_league import LEAGUE, PLANES, served
 from serve_app.runtime import haproxy
-from serve_app.runtime.launch import running
 
 CONCURRENCY = (1, 2, 4, 8, 16)
 PROTOCOLS = {"http": "REST", "grpc": "gRPC"}
 STABLE = 30
 """Variation of three successive windows, in percent, up to which a measurement counts as stable."""
 TRIALS = 20
-TOLERANCE = 0.05
+TOLERANCE = 5.0
 NEEDS = "it needs libb64.so.0d (libb64-0d) and libcudart.so.12 (nvidia-cuda-runtime-cu12) on LD_LIBRARY_PATH"
 CLIENT, SERVER, RESULT = (
     re.compile(pattern)
@@ -55,11 +54,6 @@ class Measured:
     client: int
     server: int
 
-    @property
-    def agrees(self) -> bool:
-        """Whether the counts of client and server are about equal."""
-        return abs(self.server - self.client) <= TOLERANCE * self.client
-
 
 def find() -> str:
     """The path of perf_analyzer. Raises RuntimeError if it does not start."""
@@ -84,53 +78,23 @@ def measure(tool: str, model: str, protocol: str, address: str, concurrency: int
             "--max-trials", str(TRIALS), "--input-data", data.name,
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True)
-    found = [each.search(done.stdout) for each in (CLIENT, SERVER, RESULT)]
-    if done.returncode or None in found:
+    matches = [pattern.search(done.stdout) for pattern in (CLIENT, SERVER, RESULT)]
+    if done.returncode or None in matches:
         raise RuntimeError(f"{' '.join(command)} exited with {done.returncode}:\n{done.stdout}{done.stderr}")
-    client, server, result = (each.groups() for each in found if each is not None)
+    client, server, result = (match.groups() for match in matches if match is not None)
     return Measured(float(result[0]), int(result[1]), int(client[0]), int(server[0]))
 
 
-def report(tool: str, model: str, addresses: dict[str, str], concurrency: Sequence[int], milliseconds: int) -> bool:
-    """Print each run; whether all succeed and all counts agree."""
-    print(f"{'protocol':>9} {'concurrency':>12} {'requests/s':>11} {'mean ms':>8} {'client':>8} {'server':>8}")
-    fine = True
-    for protocol, address in addresses.items():
-        for each in concurrency:
-            try:
-                found = measure(tool, model, protocol, address, each, milliseconds)
-            except RuntimeError as error:
-                print(f"{PROTOCOLS[protocol]:>9} {each:>12} {error}", flush=True)
-                fine = False
-                continue
-            print(
-                f"{PROTOCOLS[protocol]:>9} {each:>12} {found.rate:>11,.0f} {found.latency / 1000:>8.2f}"
-                f" {found.client:>8,} {found.server:>8,}",
-                flush=True,
-            )
-            fine &= found.agrees
-    return fine
-
-
-def main() -> int:
-    """Print each run; 1 if one fails or its counts disagree."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="windows of 1 s instead of 5 s")
-    milliseconds = 1000 if parser.parse_args().quick else 5000
-    try:
-        tool = find()
-    except RuntimeError as error:
-        print(error, file=sys.stderr)
-        return 1
-    with tempfile.TemporaryDirectory() as scratch:
-        registry = publish(Path(scratch), versions=1)
-        port, grpc_port = haproxy.free_ports(2, "127.0.0.1")
-        with running(registry.storage, port=port, grpc_port=grpc_port, replicas=1):
-            addresses = {"http": f"127.0.0.1:{port}", "grpc": f"127.0.0.1:{grpc_port}"}
-            fine = report(tool, LEAGUE, addresses, CONCURRENCY, milliseconds)
-    print(f"all runs succeed, and counts of client and server agree: {'met' if fine else 'MISSED'}")
-    return int(not fine)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def main(quick: Quick = False) -> Iterator[Target]:
+    """Measure both protocols."""
+    tool = find()
+    port, grpc_port = haproxy.free_ports(2, "127.0.0.1")
+    addresses = {"http": f"127.0.0.1:{port}", "grpc": f"127.0.0.1:{grpc_port}"}
+    with served(port=port, grpc_port=grpc_port, replicas=1):
+        for protocol, address in addresses.items():
+            for concurrency in CONCURRENCY:
+                result = measure(tool, LEAGUE, protocol, address, concurrency, 1000 if quick else 5000)
+                difference = 100 * abs(result.server - result.client) / result.client
+                note = f"{result.rate:,.0f} requests/s, mean {result.latency / 1000:.2f} ms; counted {result.client:,}"
+                name = f"{PROTOCOLS[protocol]}, concurrency {concurrency}: difference of the counts"
+                yield Target(name, round(difference, 1), "%", at_most=TOLERANCE, note=note)

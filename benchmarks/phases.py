@@ -5,20 +5,17 @@ networks, exploration and transitions for the buffer, compared with the unmodifi
 and without a network. These two alternate; a rate is the median over the rounds. In one step, all agents to move act.
 """
 
-import argparse
-import statistics
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from types import ModuleType
 
 from mpe2 import simple_adversary_v3, simple_spread_v3
 from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
 
+from benchmarks.harness import CONFIGS, Parts, Quick, Target, chosen, in_rounds, rate
 from benchmarks.sampling import in_parallel, in_turns
-from benchmarks.training.learned import local_ray, one_thread, report_target
+from benchmarks.training.learned import local_ray, one_thread
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.metrics import PHASES, totals
@@ -26,7 +23,6 @@ from training.algorithms.off_policy import OffPolicy
 from training.runs.trial import build_algorithm
 from training.sampling.replay_runner import ReplayRunner
 
-CONFIGS = Path(__file__).parent.parent / "policy_league/configs"
 SAMPLING = 0.75
 """Minimum ratio to the rate of the unmodified environment."""
 
@@ -48,28 +44,30 @@ PARTS = {
 }
 
 
-def measure(name: str, part: Phase, seconds: float, rounds: int) -> bool:
-    """Print the two lines of one configuration."""
+def measure(name: str, part: Phase, seconds: float, rounds: int) -> Iterator[Target]:
+    """Measure one configuration."""
     # Opponents would need networks or scripts, which the unmodified environment does not run either.
     league = LeagueConfig.load(CONFIGS / f"{name}.yaml").with_training(runners=0, learning_starts=1000, opponents=[])
     algorithm = build_algorithm(league, interface(league))
     assert isinstance(algorithm, OffPolicy)
     algorithm.reset_episodes(0)
-    rate, phases = learning(algorithm, part, seconds)
-    split = ", ".join(f"{phase} {share:.0%}" for phase, share in phases.items())
-    print(f"{name} ({league.training.algorithm}): learning on {rate:,.0f} environment steps/s: {split}")
+    steps, phases = learning(algorithm, part, seconds)
+    note = ", ".join(f"{phase} {share:.0%}" for phase, share in phases.items())
+    yield Target(f"{name}, with learning", round(steps), "steps/s", note=note)
     runner = algorithm.env_runner_group.local_env_runner
     assert isinstance(runner, ReplayRunner)
-    rates: dict[str, list[float]] = {"sampling": [], "bare": []}
-    for _ in range(rounds):
-        rates["sampling"].append(sampling_rate(runner, part, algorithm.settings.exploration.final, seconds / 10))
-        rates["bare"].append(part.bare(part.module, seconds / 10))
-    algorithm.stop()
-    ours, bare = (statistics.median(each) for each in rates.values())
-    print(f"{name}: sampling alone {ours:,.0f}, the stock environment {bare:,.0f} environment steps/s")
-    return report_target(
-        f"{name}, sampling {ours / bare:.2f}× of the bare environment", f"{SAMPLING}×", ours >= SAMPLING * bare
+    exploration = algorithm.settings.exploration.final
+
+    def sample() -> float:
+        return runner.transitions(part.agents * 1000, exploration)[0] / part.agents
+
+    rates = in_rounds(
+        {"ours": lambda: rate(sample, seconds / 10), "stock": lambda: part.bare(part.module, seconds / 10)}, rounds
     )
+    algorithm.stop()
+    note = f"{rates['ours']:,.0f} to {rates['stock']:,.0f} steps/s"
+    ratio = rates["ours"] / rates["stock"]
+    yield Target(f"{name}, sampling", ratio, "×", at_least=SAMPLING, peer="the stock environment", note=note)
 
 
 def learning(algorithm: OffPolicy, part: Phase, seconds: float) -> tuple[float, dict[str, float]]:
@@ -78,35 +76,15 @@ def learning(algorithm: OffPolicy, part: Phase, seconds: float) -> tuple[float, 
         algorithm.train()
     phases, first, began = dict.fromkeys(PHASES, 0.0), algorithm.steps, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds:
-        taken = totals(algorithm.train())
-        phases = {phase: value + taken[phase] for phase, value in phases.items()}
+        times = totals(algorithm.train())
+        phases = {phase: value + times[phase] for phase, value in phases.items()}
     shares = {phase.removeprefix("time/"): value / elapsed for phase, value in phases.items()}
     return (algorithm.steps - first) / part.agents / elapsed, shares | {"other": 1 - sum(shares.values())}
 
 
-def sampling_rate(runner: ReplayRunner, part: Phase, exploration: float, seconds: float) -> float:
-    """Environment steps per second of play with exploration, including transitions for the buffer."""
-    steps, began = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - began) < seconds:
-        steps += runner.transitions(part.agents * 1000, exploration)[0]
-    return steps / part.agents / elapsed
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure the requested configurations; 1 if a target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
-    parser.add_argument("--quick", action="store_true", help="a few seconds each")
-    given = parser.parse_args(arguments)
-    if unknown := [part for part in given.parts if part not in PARTS]:
-        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
+def main(parts: Parts = None, quick: Quick = False) -> Iterator[Target]:
+    """Measure the configurations."""
     one_thread()
     with local_ray(cpus=1):
-        seconds, rounds = (5.0, 3) if given.quick else (40.0, 7)
-        missed = [name for name in given.parts or PARTS if not measure(name, PARTS[name], seconds, rounds)]
-    print(f"\nmissed: {', '.join(missed)}" if missed else "\nall met")
-    return bool(missed)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        for name, part in chosen(parts, PARTS).items():
+            yield from measure(name, part, *(5.0, 3) if quick else (40.0, 7))

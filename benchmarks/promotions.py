@@ -10,31 +10,29 @@ server: the 99th percentile of the latency with promotions divided by that witho
 which the median counts.
 """
 
-import argparse
 import os
-import subprocess
-import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from statistics import median
+from typing import Annotated
 
 import numpy as np
 import orjson
+import typer
 from numpy.typing import NDArray
 
-from benchmarks.leagues.served_league import BODY, LEAGUE, publish
-from benchmarks.load.http import Load, drive, measure
-from benchmarks.processes import haproxy_processes
+from benchmarks.harness import Quick, Target
+from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, promote, served
+from benchmarks.load.elsewhere import Stage, beside
+from benchmarks.load.http import drive, measure
 from league.registry.registry import Registry
-from serve_app.runtime.launch import running
+from tests.support.servers.processes import haproxy_processes
+from tests.support.waiting import until
 
-ROOT = Path(__file__).parent.parent
 CLIENTS = 8
 REPLICAS = 2
 REQUESTS = 1_000_000
@@ -50,165 +48,123 @@ class MeasuredPromotion:
 
     version: int
     start: float
-    returned: float
     everywhere: float
 
 
-def main() -> int:
-    """Print the counts; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--promotions", type=int, default=1_000)
-    parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=10.0, help="seconds of each run at half the rate")
-    parser.add_argument("--quick", action="store_true", help="smoke test: 20 promotions, one short pair")
-    parser.add_argument("--load", nargs=2, metavar=("URL", "FILE"), help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.load:
-        _load(*options.load)
-        return 0
-    count, pairs, seconds = (20, 1, 2.0) if options.quick else (options.promotions, options.pairs, options.seconds)
-    with tempfile.TemporaryDirectory() as scratch:
-        registry = publish(Path(scratch) / "home", versions=2)
-        replies = Path(scratch) / "replies.npy"
-        with running(registry.storage, replicas=REPLICAS) as url:
-            _await_replicas(registry, 1)
-            before, started = _settled(), set[int]()
-            with _loading(url, replies):
-                promotions = []
-                for i in range(count):
-                    promotions.append(_promote(registry, 2 - i % 2))
-                    started |= haproxy_processes() - before
-            met = [_report(promotions, np.load(replies), len(started), None if options.quick else REQUESTS)]
-            met.append(_pairs(url, registry, pairs, seconds))
-        registry.close()
-    return int(not all(met))
+def main(
+    quick: Quick = False,
+    promotions: int = 1_000,
+    pairs: int = 5,
+    seconds: Annotated[float, typer.Option(help="of each run at half the rate")] = 10.0,
+) -> Iterator[Target]:
+    """Promote under load."""
+    count, pairs, seconds = (20, 1, 2.0) if quick else (promotions, pairs, seconds)
+    with served(2, replicas=REPLICAS) as (url, registry):
+        _await_replicas(registry, 1)
+        before, reloaded = _settled(), set[int]()
+        with beside(_load, url) as outcome:
+            moves = []
+            for i in range(count):
+                moves.append(_promote(registry, 2 - i % 2))
+                reloaded |= haproxy_processes() - before
+        yield from _counts(moves, outcome.result, None if quick else REQUESTS)
+        yield Target("reloads of HAProxy", len(reloaded), at_most=0)
+        yield _pairs(url, registry, pairs, seconds)
 
 
-def _report(promotions: list[MeasuredPromotion], replies: NDArray, reloads: int, enough: int | None) -> bool:
+def _counts(promotions: list[MeasuredPromotion], replies: NDArray, enough: int | None) -> Iterator[Target]:
     """replies: (n, 3): time of sending, time of the answer, and its version, 0 without one."""
     sent, answered, version = replies.T
-    failed = int((version == 0).sum())
-    wrong = sum(
-        int(((sent > now.everywhere) & (answered < then.start) & (version != now.version) & (version != 0)).sum())
-        for now, then in pairwise(promotions)
+    stale = sum(
+        int(
+            (
+                (sent > current.everywhere)
+                & (answered < following.start)
+                & (version != current.version)
+                & (version != 0)
+            ).sum()
+        )
+        for current, following in pairwise(promotions)
     )
+    note = f"{len(replies) / (answered.max() - sent.min()):,.0f}/s, {len(promotions)} promotions, {CLIENTS} clients"
+    yield Target("requests", len(replies), at_least=enough, note=note)
+    yield Target("requests that failed", int((version == 0).sum()), at_most=0)
+    yield Target("answers by a version that was replaced everywhere", stale, at_most=0)
     reached = np.array([promotion.everywhere - promotion.start for promotion in promotions])
-    p99 = float(np.percentile(reached, 99))
-    seconds = answered.max() - sent.min()
-    print(f"{len(promotions)} promotions, {CLIENTS} clients, {REPLICAS} replicas: {len(replies):,} requests, ", end="")
-    print(f"{len(replies) / seconds:,.0f}/s" + (f"   (at least {enough:,} requests)" if enough else ""))
-    print(f"failed requests: {failed}   (at most 0)")
-    print(f"answered by a version that was replaced everywhere: {wrong}   (at most 0)")
-    print(f"reloads of HAProxy: {reloads}   (at most 0)")
-    print(f"promotion → every replica: median {np.median(reached):.3f} s, p99 {p99:.3f} s, ", end="")
-    print(f"longest {reached.max():.3f} s   (p99 at most {TARGET:g} s)")
-    return not failed + wrong + reloads and p99 <= TARGET and len(replies) >= (enough or 0)
+    note = f"median {np.median(reached):.3f} s, longest {reached.max():.3f} s"
+    yield Target("promotion, p99", round(float(np.percentile(reached, 99)), 3), "s", at_most=TARGET, note=note)
 
 
-def _pairs(url: str, registry: Registry, pairs: int, seconds: float) -> bool:
-    address = f"{url}/v1/policies/{LEAGUE}/action"
-    rate = measure(address, BODY, connections=32, seconds=seconds / 2).rate / 2
+def _pairs(url: str, registry: Registry, pairs: int, seconds: float) -> Target:
+    rate = measure(url + ACTION, BODY, connections=32, seconds=seconds / 2).rate / 2
     ratios = []
-    for number in range(pairs):
-        steady = measure(address, BODY, connections=CLIENTS, seconds=seconds, rate=rate)
-        with _promoting(registry) as promotions:
-            moving = measure(address, BODY, connections=CLIENTS, seconds=seconds, rate=rate)
+    for _ in range(pairs):
+        steady = measure(url + ACTION, BODY, connections=CLIENTS, seconds=seconds, rate=rate)
+        with _promoting(registry):
+            moving = measure(url + ACTION, BODY, connections=CLIENTS, seconds=seconds, rate=rate)
         ratios.append(moving.p99 / steady.p99)
-        print(f"pair {number + 1}, {rate:,.0f}/s: {_format(steady)} without, ", end="")
-        print(f"{_format(moving)} with {len(promotions)} promotions: {ratios[-1]:.2f}×", flush=True)
-    print(f"p99 with promotions over without: {median(ratios):.2f}×   (at most {SLOWER:g}×)")
-    return median(ratios) <= SLOWER
-
-
-def _format(load: Load) -> str:
-    failed = f", {load.failed} failed" if load.failed else ""
-    return f"p50 {load.p50:.2f} ms, p99 {load.p99:.2f} ms{failed}"
+    note = f"{rate:,.0f}/s; pairs {', '.join(f'{ratio:.2f}' for ratio in ratios)}"
+    return Target("p99 of requests during promotions", median(ratios), "×", None, SLOWER, peer="without", note=note)
 
 
 @contextmanager
-def _promoting(registry: Registry) -> Iterator[list[MeasuredPromotion]]:
+def _promoting(registry: Registry) -> Iterator[None]:
     """Promote continuously while the context lasts."""
-    promotions: list[MeasuredPromotion] = []
     is_over = threading.Event()
 
     def promote() -> None:
         # Usually the promoting process runs elsewhere: here it uses only the CPU time that others leave.
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 15)
         while not is_over.is_set():
-            promotions.append(_promote(registry, 3 - registry.aliases.current(LEAGUE)["champion"], every=0.05))
+            _promote(registry, 3 - registry.aliases.current(LEAGUE)["champion"])
+            time.sleep(0.05)
 
     thread = threading.Thread(target=promote)
     thread.start()
     try:
-        yield promotions
+        yield
     finally:
         is_over.set()
         thread.join()
 
 
-def _promote(registry: Registry, version: int, every: float = 0.005) -> MeasuredPromotion:
-    """Move the champion and wait for all replicas, polling at this interval in seconds."""
+def _promote(registry: Registry, version: int) -> MeasuredPromotion:
+    """Move the champion and wait for all replicas."""
     start = time.perf_counter()
-    expected = registry.aliases.current(LEAGUE)["champion"]
-    registry.aliases.set(LEAGUE, "champion", version, expected=expected, actor="benchmark", reason="back and forth")
-    returned = time.perf_counter()
-    _await_replicas(registry, version, every)
-    return MeasuredPromotion(version, start, returned, time.perf_counter())
+    promote(registry, version)
+    _await_replicas(registry, version)
+    return MeasuredPromotion(version, start, time.perf_counter())
 
 
-def _await_replicas(registry: Registry, version: int, every: float = 0.005) -> None:
+def _await_replicas(registry: Registry, version: int) -> None:
     """Return when all replicas have acknowledged a version."""
-    deadline = time.monotonic() + 30
-    while sum(row.version == version for row in registry.replicas.acknowledgements(LEAGUE)) < REPLICAS:
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"version {version} did not reach every replica within 30 s")
-        time.sleep(every)
+
+    def acknowledged() -> bool:
+        rows = registry.replicas.acknowledgements(LEAGUE)
+        return sum(row.version == version for row in rows) >= REPLICAS
+
+    until(acknowledged, 30)
 
 
 def _settled(seconds: float = 3.0) -> set[int]:
     """HAProxy's processes, once they have not changed for a while: a new replica causes a reload, too."""
-    known, since = haproxy_processes(), time.monotonic()
+    processes, since = haproxy_processes(), time.monotonic()
     while time.monotonic() < since + seconds:
         time.sleep(0.1)
-        if (now := haproxy_processes()) != known:
-            known, since = now, time.monotonic()
-    return known
+        if (current := haproxy_processes()) != processes:
+            processes, since = current, time.monotonic()
+    return processes
 
 
-@contextmanager
-def _loading(url: str, replies: Path) -> Iterator[None]:
-    """Request actions in a subprocess while the context lasts; the replies are in the file afterwards."""
-    command = [sys.executable, "-m", "benchmarks.promotions", "--load", url, str(replies)]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as load:
-        assert load.stdin is not None
-        assert load.stdout is not None
-        load.stdout.readline()  # the first reply
-        try:
-            yield
-        finally:
-            load.stdin.close()
-
-
-def _load(url: str, file: str) -> None:
-    """Send requests until standard input is closed."""
-    import threading
-
-    import uvloop
-
-    stop = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
+async def _load(stage: Stage, url: str) -> NDArray:
+    """Send requests until the stage is over; returns the replies, see `_counts`."""
     replies: list[tuple[float, float, int]] = []
 
     def on_reply(status: int, body: bytes, sent_at: float) -> bool:
         if not replies:
-            print("answered", flush=True)
+            stage.ready()
         replies.append((sent_at, time.perf_counter(), orjson.loads(body)["version"] if status == 200 else 0))
-        return not stop.is_set()
+        return not stage.is_over
 
-    address = f"{url}/v1/policies/{LEAGUE}/action"
-    uvloop.run(drive(address, BODY, CLIENTS, on_reply, lambda: not stop.is_set()))
-    np.save(file, np.array(replies))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    await drive(url + ACTION, BODY, CLIENTS, on_reply, lambda: not stage.is_over)
+    return np.array(replies)

@@ -8,7 +8,6 @@ follower-check    5,000 replicas: time of one look of `--wait`; of a change toke
 The watchers are those of replicas, but load nothing. Leagues and replicas of the last two are rows.
 """
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -19,12 +18,13 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median, quantiles
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from sqlalchemy import insert, select
 
-from benchmarks.attacks.postgresql_leagues import ROOT, promote, standalone_replica
-from benchmarks.leagues.served_league import LEAGUE, fill
+from benchmarks.harness import ROOT, Parts, Quick, Target, chosen
+from benchmarks.leagues.served_league import LEAGUE, fill, promote
 from benchmarks.registry import server_load
 from league.errors import NotReady
 from league.registry.registry import Registry
@@ -33,14 +33,13 @@ from league.registry.storage.rows import ReadPosition, ServedState
 from league.registry.storage.tables import AliasEventTable, AliasTable, LeagueTable, ReplicaTable, VersionTable
 from league.settings import Storage
 from tests.support.servers import postgresql
+from tests.support.servers.postgresql_replicas import standalone_replica
 
 SETTLED, MEASURED = 15.0, 60.0
 """Seconds."""
 WATCHERS, LEAGUES, REPLICAS = 200, 1000, 5000
 PROMOTIONS, ACKNOWLEDGEMENTS, LOOKS = 200, 40, 100
 HIDDEN = (8,)
-PARTS = ("idle", "acknowledgement", "follower-check", "watchers")
-"""The last one confines this process to one core."""
 CPU, CONNECTIONS, PROMOTED, ACKNOWLEDGED, LOOKED = 1.0, 1, 0.5, 50.0, 5.0
 """Targets: ms per second, number, s, ms, ms. Before the change counter 5, 2, –, 5,880 and 95."""
 
@@ -49,29 +48,26 @@ class _EnoughLooks(Exception):
     pass
 
 
-def main() -> int:
-    """Print the measurements; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="smoke test: few replicas, promotions and seconds")
-    parser.add_argument("--only", choices=PARTS, action="append", help="measure this part; may be repeated")
-    parser.add_argument("--watchers", type=int, default=WATCHERS, help="number of replicas of this part")
-    parser.add_argument("--promotions", type=int, default=PROMOTIONS, help="of the same part")
-    options = parser.parse_args()
-    watched = (10, 10) if options.quick else (options.watchers, options.promotions)
-    met = [_measured(part, options.quick, *watched) for part in options.only or PARTS]
-    return int(not all(met))
-
-
-def _measured(part: str, quick: bool, watchers: int, promotions: int) -> bool:
-    core = server_load.on_one_core() if part == "watchers" else None
-    with _registry() as (registry, socket):
-        if part == "idle":
-            return _idle(registry, socket, SETTLED, 5.0 if quick else MEASURED)
-        if part == "acknowledgement":
-            return _acknowledgement(registry, 50 if quick else LEAGUES)
-        if part == "follower-check":
-            return _follower_check(registry, socket, 50 if quick else REPLICAS)
-        return _watchers(registry, socket, core, watchers, promotions)
+def main(
+    parts: Parts = None,
+    quick: Quick = False,
+    watchers: Annotated[int, typer.Option(help="number of replicas of this part")] = WATCHERS,
+    promotions: Annotated[int, typer.Option(help="of the same part")] = PROMOTIONS,
+) -> Iterator[Target]:
+    """Measure the parts."""
+    if quick:
+        watchers, promotions = 10, 10
+    cases: dict[str, Callable[[Registry, Path], Iterator[Target]]] = {
+        "idle": lambda registry, socket: _idle(registry, socket, SETTLED, 5.0 if quick else MEASURED),
+        "acknowledgement": lambda registry, _: _acknowledgement(registry, 50 if quick else LEAGUES),
+        "follower-check": lambda registry, socket: _follower_check(registry, socket, 50 if quick else REPLICAS),
+        "watchers": lambda registry, socket: _watchers(registry, socket, watchers, promotions),
+    }
+    for name, part in chosen(parts, cases).items():
+        if name == "watchers":
+            server_load.on_one_core()
+        with _registry() as (registry, socket):
+            yield from part(registry, socket)
 
 
 @contextmanager
@@ -91,7 +87,7 @@ def _registry() -> Iterator[tuple[Registry, Path]]:
         registry.close()
 
 
-def _idle(registry: Registry, socket: Path, settled: float, seconds: float) -> bool:
+def _idle(registry: Registry, socket: Path, settled: float, seconds: float) -> Iterator[Target]:
     server = server_load.postmaster(socket)
     registry.close()
     with standalone_replica(registry.storage, "idle"):
@@ -100,12 +96,9 @@ def _idle(registry: Registry, socket: Path, settled: float, seconds: float) -> b
         busy = _busy(server, seconds)
     time.sleep(settled)
     alone = _busy(server, seconds)
-    print(
-        f"idle replica: {busy - alone:.2f} ms of PostgreSQL's processor time per second ({busy:.2f} with the replica,"
-        f" {alone:.2f} without), {connections} connections   (at most {CPU:g} ms, {CONNECTIONS})",
-        flush=True,
-    )
-    return busy - alone <= CPU and connections <= CONNECTIONS
+    note = f"{busy:.2f} with the replica, {alone:.2f} without"
+    yield Target("idle replica, PostgreSQL's time", round(busy - alone, 2), "ms/s", at_most=CPU, note=note)
+    yield Target("idle replica, connections", connections, at_most=CONNECTIONS)
 
 
 def _busy(server: int, seconds: float) -> float:
@@ -115,7 +108,7 @@ def _busy(server: int, seconds: float) -> float:
     return 1000 * (server_load.cpu_seconds(server) - before) / (time.monotonic() - at)
 
 
-def _acknowledgement(registry: Registry, leagues: int) -> bool:
+def _acknowledgement(registry: Registry, leagues: int) -> Iterator[Target]:
     names = _copies_of_the_league(registry, leagues)
     newest = max(target.event for target in registry.aliases.all().values())
     position = ReadPosition(registry.changes.counts().to_acknowledge, newest, 0)
@@ -129,15 +122,13 @@ def _acknowledgement(registry: Registry, leagues: int) -> bool:
         _milliseconds(lambda: registry.replicas.acknowledge("replica", position, loading))
         for _ in range(ACKNOWLEDGEMENTS)
     ]
-    print(
-        f"{leagues:,} leagues followed: acknowledged in {median(followed):.1f} ms   (at most {ACKNOWLEDGED:g} ms);"
-        f" while all of them load a version: {median(differing):.1f} ms",
-        flush=True,
+    note = f"{leagues:,} leagues; while all of them load a version {median(differing):.1f} ms"
+    yield Target(
+        "acknowledgement of followed leagues", round(median(followed), 1), "ms", at_most=ACKNOWLEDGED, note=note
     )
-    return median(followed) <= ACKNOWLEDGED
 
 
-def _follower_check(registry: Registry, socket: Path, replicas: int) -> bool:
+def _follower_check(registry: Registry, socket: Path, replicas: int) -> Iterator[Target]:
     event = promote(registry, 2)
     _add_replicas(registry, replicas, event.id)
     registry.replicas.register("late", {})
@@ -145,18 +136,14 @@ def _follower_check(registry: Registry, socket: Path, replicas: int) -> bool:
     before = server_load.cpu_seconds(server), time.process_time()
     looks = _time_between_looks(registry, event)
     busy = [
-        1000 * (now - then) / LOOKS
-        for now, then in zip((server_load.cpu_seconds(server), time.process_time()), before, strict=True)
+        1000 * (end - begin) / LOOKS
+        for end, begin in zip((server_load.cpu_seconds(server), time.process_time()), before, strict=True)
     ]
     tokens = [_milliseconds(lambda: registry.changes.token(LEAGUE)) for _ in range(LOOKS)]
     heartbeats = [_milliseconds(lambda: _heartbeat(registry)) for _ in range(LOOKS)]
-    print(
-        f"{replicas:,} replicas: one look of --wait {median(looks):.2f} ms   (at most {LOOKED:g} ms; processor time"
-        f" {busy[0]:.2f} ms of PostgreSQL, {busy[1]:.2f} ms of the client);"
-        f" a change token {median(tokens):.1f} ms, a heartbeat {median(heartbeats):.1f} ms",
-        flush=True,
-    )
-    return median(looks) <= LOOKED
+    note = f"{replicas:,} replicas; processor time {busy[0]:.2f} ms of PostgreSQL, {busy[1]:.2f} ms of the client"
+    yield Target("one look of --wait", round(median(looks), 2), "ms", at_most=LOOKED, note=note)
+    yield Target("change token, heartbeat", (round(median(tokens), 1), round(median(heartbeats), 1)), "ms")
 
 
 def _time_between_looks(registry: Registry, event: Any) -> list[float]:
@@ -179,7 +166,7 @@ def _heartbeat(registry: Registry) -> None:
     registry.replicas.silent()
 
 
-def _watchers(registry: Registry, socket: Path, core: int | None, number: int, promotions: int) -> bool:
+def _watchers(registry: Registry, socket: Path, number: int, promotions: int) -> Iterator[Target]:
     storage = registry.storage
     command = [sys.executable, "-m", "benchmarks.registry.watchers", str(number), str(storage.home)]
     with subprocess.Popen(
@@ -195,12 +182,8 @@ def _watchers(registry: Registry, socket: Path, core: int | None, number: int, p
         busy = server_load.cpu_seconds(server) + server_load.process_seconds(process.pid) - before
         process.stdin.close()
     p99 = quantiles(seconds, n=100, method="inclusive")[98]
-    print(
-        f"{number} watchers and PostgreSQL on core {core}: promotion confirmed by all after {median(seconds):.3f} s,"
-        f" p99 {p99:.3f} s   (at most {PROMOTED:g} s); processor time of a promotion {busy / promotions:.3f} s",
-        flush=True,
-    )
-    return p99 <= PROMOTED
+    note = f"median {median(seconds):.3f} s, processor time {busy / promotions:.3f} s"
+    yield Target(f"promotion to {number} watchers, p99", round(p99, 2), "s", at_most=PROMOTED, note=note)
 
 
 def _promote(registry: Registry, version: int, number: int) -> float:
@@ -219,10 +202,10 @@ def _copies_of_the_league(registry: Registry, number: int) -> list[str]:
     with registry.database.write() as session:
         for table in (LeagueTable, VersionTable):
             name = "slug" if table is LeagueTable else "league"
-            found = session.execute(select(table.__table__).filter_by(**{name: LEAGUE})).mappings()
-            session.execute(insert(table), [dict(row) | {name: copy} for row in found for copy in names])
-        now = clock(session)
-        event = {"alias": "champion", "kind": "set", "version": 1, "actor": "benchmark", "reason": "many", "at": now}
+            rows = session.execute(select(table.__table__).filter_by(**{name: LEAGUE})).mappings()
+            session.execute(insert(table), [dict(row) | {name: copy} for row in rows for copy in names])
+        moment = clock(session)
+        event = {"alias": "champion", "kind": "set", "version": 1, "actor": "benchmark", "reason": "many", "at": moment}
         session.execute(insert(AliasEventTable), [event | {"league": name} for name in names])
         events = session.execute(select(AliasEventTable.id, AliasEventTable.league))
         aliases = [{"league": name, "name": "champion", "version": 1, "event": id_} for id_, name in events]
@@ -240,7 +223,3 @@ def _milliseconds(function: Callable[[], object]) -> float:
     began = time.perf_counter()
     function()
     return 1000 * (time.perf_counter() - began)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,22 +6,22 @@ keeps agents together (`synchronized`) and in its default mode, which draws agen
 calls in a round; compared measurements alternate; one thread.
 """
 
-import argparse
 import statistics
-import sys
-import time
-from collections.abc import Callable
+import timeit
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from ray.rllib.env.multi_agent_episode import MultiAgentEpisode
 from ray.rllib.utils.replay_buffers.multi_agent_episode_buffer import MultiAgentEpisodeReplayBuffer
 
+from benchmarks.harness import Quick, Target, in_rounds
 from league.config.off_policy import PrioritiesConfig
 from training.replay_buffer import ReplayBuffer, TransitionBlock
 
 STEPS, BATCH, LENGTH, NUMBERS = 100_000, 1024, 25, 18
 AGENTS = ("agent_0", "agent_1", "agent_2")
-MAX_SECONDS, FASTER = 1e-3, 50.0
+MAX_MILLISECONDS, FASTER = 1.0, 50.0
 
 
 def our_buffer(priorities: PrioritiesConfig | None) -> ReplayBuffer:
@@ -66,46 +66,24 @@ def rllib_buffer(steps: int) -> MultiAgentEpisodeReplayBuffer:
     return buffer
 
 
-def seconds(call: Callable[[], object], calls: int) -> float:
-    """The median duration of some calls."""
-    taken = []
-    for _ in range(calls):
-        began = time.perf_counter()
-        call()
-        taken.append(time.perf_counter() - began)
-    return statistics.median(taken)
-
-
-def main() -> int:
-    """Print the durations; 1 if a target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer steps in RLlib's buffer and fewer calls")
-    quick = parser.parse_args().quick
+def main(quick: Quick = False) -> Iterator[Target]:
+    """Measure the buffers in turn."""
     uniform, prioritised = our_buffer(None), our_buffer(PrioritiesConfig())
     buffer = rllib_buffer(STEPS // 10 if quick else STEPS)
-    contestants: dict[str, Callable[[], object]] = {
-        "ours, uniform": lambda: uniform.sample(BATCH),
-        "ours, uniform, 3 steps": lambda: uniform.sample(BATCH, n_step=3, gamma=0.99),
-        "ours, prioritised": lambda: prioritised.sample(BATCH),
-        "ours, prioritised, 3 steps": lambda: prioritised.sample(BATCH, n_step=3, gamma=0.99),
+    samples: dict[str, Callable[[], object]] = {
+        "uniform": lambda: uniform.sample(BATCH),
+        "uniform, 3 steps": lambda: uniform.sample(BATCH, n_step=3, gamma=0.99),
+        "prioritised": lambda: prioritised.sample(BATCH),
+        "prioritised, 3 steps": lambda: prioritised.sample(BATCH, n_step=3, gamma=0.99),
         "RLlib, synchronized": lambda: buffer.sample(BATCH, replay_mode="synchronized"),
         "RLlib, independent": lambda: buffer.sample(BATCH * len(AGENTS), replay_mode="independent"),
     }
-    rounds = 2 if quick else 5
-    taken: dict[str, list[float]] = {name: [] for name in contestants}
-    for _ in range(rounds):
-        for name, call in contestants.items():
-            taken[name].append(seconds(call, 5 if name.startswith("RLlib") else 100))
-    medians = {name: statistics.median(values) for name, values in taken.items()}
-    for name, value in medians.items():
-        print(f"{name:>28}: {1e3 * value:8.3f} ms for {BATCH} steps of {len(AGENTS)} agents")
-    slowest = max(value for name, value in medians.items() if name.startswith("ours"))
-    factor = min(value for name, value in medians.items() if name.startswith("RLlib")) / medians["ours, uniform"]
-    met = slowest <= MAX_SECONDS and factor >= FASTER
-    print(f"slowest of ours {1e3 * slowest:.3f} ms, target 1 ms; {factor:.0f}× RLlib's fastest, target {FASTER:g}×")
-    print("met" if met else "MISSED")
-    return not met
 
+    def measure(name: str) -> float:
+        return statistics.median(timeit.repeat(samples[name], number=1, repeat=5 if "RLlib" in name else 100))
 
-if __name__ == "__main__":
-    sys.exit(main())
+    medians = in_rounds({name: partial(measure, name) for name in samples}, 2 if quick else 5)
+    for name, seconds in medians.items():
+        yield Target(name, round(1e3 * seconds, 3), "ms", at_most=None if "RLlib" in name else MAX_MILLISECONDS)
+    fastest = min(seconds for name, seconds in medians.items() if "RLlib" in name)
+    yield Target("uniform", fastest / medians["uniform"], "×", at_least=FASTER, peer="RLlib's fastest")

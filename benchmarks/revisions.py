@@ -1,13 +1,10 @@
 """Is this code as fast as another checkout of it: serving, sampling, stepping and a tournament?
 
-    python -m benchmarks.revisions CHECKOUT [--only PART] [--rounds N] [--seconds S]
-
 Both checkouts use the installed dependencies. Each measures itself with its own benchmark modules, in a process of its
 own; they alternate within a round, each second round in reverse order, and a ratio is the median over the rounds. Rates
 are those of one core, except for serving, where the server, HAProxy and the load generator share all cores.
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -18,7 +15,8 @@ from pathlib import Path
 from statistics import median
 from typing import IO
 
-HERE = Path(__file__).parents[1]
+from benchmarks.harness import ROOT, Parts, Quick, Target, chosen
+
 AT_LEAST = 0.97
 """Minimum ratio of each rate to that of the other checkout."""
 WORKER = """
@@ -49,11 +47,13 @@ for line in sys.stdin:
     print(rate(float(line)), file=results, flush=True)
 """
 STEPPING = """
-from dataclasses import fields
-from benchmarks.stepping import CASES, lockstep
+from benchmarks import stepping
 
-config, number, *_ = (getattr(CASES["{case}"], field.name) for field in fields(CASES["{case}"]))
-environment = lockstep(config, number)
+case = stepping.CASES["{case}"]
+number = case.num_envs
+# Earlier revisions call it `lockstep`.
+batched = getattr(stepping, "batched", None) or stepping.lockstep
+environment = batched(case.config, number)
 
 
 def rate(seconds):
@@ -171,24 +171,17 @@ class Worker:
         return stream
 
 
-def main() -> int:
-    """Print rates and ratios; 1 if a ratio is below 0.97."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkout", type=Path)
-    parser.add_argument("--only", action="append", choices=PARTS, metavar="PART", help=f"of {', '.join(PARTS)}")
-    parser.add_argument("--rounds", type=int, default=11)
-    parser.add_argument("--seconds", type=float, default=2.0)
-    options = parser.parse_args()
-    failed = False
-    print(f"{'':>24} {'this':>10} {'other':>10}   per second")
-    for name in options.only or PARTS:
-        rounds = list(_rounds(options.checkout, PARTS[name], options.rounds, options.seconds))
-        this, other = (median(rates) for rates in zip(*rounds, strict=True))
-        ratio = median(mine / theirs for mine, theirs in rounds)
-        failed |= ratio < AT_LEAST
-        spread = ", ".join(f"{mine / theirs:.2f}" for mine, theirs in rounds)
-        print(f"{name:>24} {this:>10,.0f} {other:>10,.0f}   {ratio:.3f}x (at least {AT_LEAST}x; {spread})", flush=True)
-    return int(failed)
+def main(
+    checkout: Path, parts: Parts = None, quick: Quick = False, rounds: int = 11, seconds: float = 2.0
+) -> Iterator[Target]:
+    """Measure the parts in both checkouts."""
+    rounds, seconds = (3, 0.5) if quick else (rounds, seconds)
+    for name, program in chosen(parts, PARTS).items():
+        pairs = list(_rounds(checkout, program, rounds, seconds))
+        ours, theirs = (median(rates) for rates in zip(*pairs, strict=True))
+        ratios = [rate / other for rate, other in pairs]
+        note = f"{ours:,.0f} to {theirs:,.0f} per second; {', '.join(f'{ratio:.2f}' for ratio in ratios)}"
+        yield Target(name, round(median(ratios), 3), "×", at_least=AT_LEAST, peer=checkout.name, note=note)
 
 
 def _rounds(checkout: Path, program: str, rounds: int, seconds: float) -> Iterator[tuple[float, float]]:
@@ -205,10 +198,6 @@ def _workers(checkout: Path, program: str) -> Iterator[tuple[Worker, Worker]]:
     with ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory())
         first, second = (
-            stack.enter_context(closing(Worker(each, program, scratch))) for each in (HERE, checkout.resolve())
+            stack.enter_context(closing(Worker(code, program, scratch))) for code in (ROOT, checkout.resolve())
         )
         yield first, second
-
-
-if __name__ == "__main__":
-    sys.exit(main())

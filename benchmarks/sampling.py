@@ -9,18 +9,14 @@ Compared measurements alternate within a round; a rate is the median over the ro
 agents act once.
 """
 
-import argparse
-import logging
-import statistics
-import sys
 import time
-import warnings
-from collections.abc import Callable, Hashable, Mapping
+import timeit
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
-import ray
 import torch
 from mpe2 import simple_spread_v3
 from pettingzoo.classic import connect_four_v3, leduc_holdem_v4
@@ -34,6 +30,9 @@ from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
 from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv, PettingZooEnv
 from ray.tune.registry import register_env
 
+from benchmarks.harness import Parts, Quick, Target, chosen, in_rounds, rate
+from benchmarks.stock import play_game
+from benchmarks.training.learned import local_ray
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.ppo import PPO, algorithm_config
@@ -57,8 +56,6 @@ STEPS, EPOCHS, MINIBATCH = 4000, 4, 128
 LARGE_MINIBATCH = 960
 """As in the bundled simple_spread, whose learning target `benchmarks.learning` measures with these settings too."""
 
-Rates = dict[Hashable, float]
-
 
 class Flat(ActorCritic):
     """The same network on observations that are not a dictionary, as returned by RLlib's wrappers."""
@@ -77,104 +74,99 @@ class Flat(ActorCritic):
         return super().compute_values({Columns.OBS: {"observation": batch[Columns.OBS]}}, embeddings)
 
 
-def simple_spread(quick: bool) -> bool:
-    """At least 50 times RLlib's best, and 6 times its default."""
-    return against_rllib(SPREAD, quick, best=50.0, default=6.0)
+def simple_spread(quick: bool) -> Iterator[Target]:
+    yield from against_rllib(SPREAD, quick, best=50.0, default=6.0)
 
 
-def connect_four(quick: bool) -> bool:
-    """At least 60 times RLlib's best, and 12 times its default."""
-    return against_rllib(FOUR, quick, best=60.0, default=12.0)
+def connect_four(quick: bool) -> Iterator[Target]:
+    yield from against_rllib(FOUR, quick, best=60.0, default=12.0)
 
 
-def against_rllib(entry_point: str, quick: bool, best: float, default: float) -> bool:
+def against_rllib(entry_point: str, quick: bool, best: float, default: float) -> Iterator[Target]:
     """One runner compared with RLlib's, for several numbers of environments."""
-    sizes = (*NUM_ENVS, *MANY_ENVS)
-    runners: dict[Hashable, EnvRunner] = {("ours", num_envs): ours(entry_point, num_envs) for num_envs in sizes}
-    runners |= {("RLlib", num_envs): rllib(entry_point, num_envs) for num_envs in NUM_ENVS}
+    sizes = {"ours": (*NUM_ENVS, *MANY_ENVS), "RLlib": NUM_ENVS}
+    runners: dict[tuple[str, int], EnvRunner] = {("ours", size): ours(entry_point, size) for size in sizes["ours"]}
+    runners |= {("RLlib", size): rllib(entry_point, size) for size in sizes["RLlib"]}
     for runner in runners.values():
         runner.sample(num_timesteps=500)
     seconds = 0.5 if quick else 2.0
-    rates: dict[tuple[str, int], float] = in_rounds(
-        {key: lambda runner=runner: sampling_rate(runner, entry_point, seconds) for key, runner in runners.items()},
+    rates = in_rounds(
+        {key: partial(sampling_rate, runner, entry_point, seconds) for key, runner in runners.items()},
         rounds=2 if quick else 5,
     )
-    print(f"{'num_envs':>8} {'ours':>12} {'RLlib':>12}   environment steps/s in one runner")
-    for num_envs in sizes:
-        theirs = f"{rates['RLlib', num_envs]:>12,.0f}" if num_envs in NUM_ENVS else ""
-        print(f"{num_envs:>8} {rates['ours', num_envs]:>12,.0f} {theirs}")
-    top = {name: max(rate for (whose, _), rate in rates.items() if whose == name) for name in ("ours", "RLlib")}
-    met = [
-        report("ours against RLlib's best", top["ours"] / top["RLlib"], best),
-        report("ours against RLlib's default (1 environment)", top["ours"] / rates["RLlib", 1], default),
-    ]
     for runner in runners.values():
         runner.stop()
-    return all(met)
+    name = short(entry_point)
+    tops = {}
+    for program, counts in sizes.items():
+        values = [rates[program, count] for count in counts]
+        tops[program] = max(values)
+        note = f"with {', '.join(map(str, counts))} environments"
+        yield Target(f"{name} by {program}", tuple(map(round, values)), "steps/s", note=note)
+    yield Target(name, tops["ours"] / tops["RLlib"], "×", at_least=best, peer="RLlib's best")
+    yield Target(name, tops["ours"] / rates["RLlib", 1], "×", at_least=default, peer="RLlib's default")
 
 
-def stock(quick: bool) -> bool:
-    """At least 75 % of the rate of the unmodified environment alone."""
-    modules = {SPREAD: simple_spread_v3, FOUR: connect_four_v3, LEDUC: leduc_holdem_v4}
-    met = [against_stock(name, module, quick) for name, module in modules.items()]
-    return all(met)
+def stock(quick: bool) -> Iterator[Target]:
+    """At least 75 % of the rate of the unmodified environment alone; one runner with 32 environments."""
+    for entry_point, module in {SPREAD: simple_spread_v3, FOUR: connect_four_v3, LEDUC: leduc_holdem_v4}.items():
+        runner, seconds = ours(entry_point, num_envs=32), 0.5 if quick else 2.0
+        runner.sample(num_timesteps=3000)
+        alone = in_parallel if entry_point == SPREAD else in_turns
+        rates = in_rounds(
+            {"ours": partial(sampling_rate, runner, entry_point, seconds), "stock": partial(alone, module, seconds)},
+            rounds=3 if quick else 7,
+        )
+        runner.stop()
+        note = f"{rates['ours']:,.0f} to {rates['stock']:,.0f} steps/s"
+        ratio = rates["ours"] / rates["stock"]
+        yield Target(short(entry_point), ratio, "×", at_least=0.75, peer="the stock environment", note=note)
 
 
-def against_stock(entry_point: str, module: Any, quick: bool) -> bool:
-    """One runner with 32 environments."""
-    runner, seconds = ours(entry_point, num_envs=32), 0.5 if quick else 2.0
-    runner.sample(num_timesteps=3000)
-    alone = in_parallel if entry_point == SPREAD else in_turns
-    rates = in_rounds(
-        {"ours": lambda: sampling_rate(runner, entry_point, seconds), "stock": lambda: alone(module, seconds)},
-        rounds=3 if quick else 7,
-    )
-    runner.stop()
-    name = entry_point.rpartition(".")[2]
-    print(f"{name}: ours {rates['ours']:,.0f}, the stock environment alone {rates['stock']:,.0f} steps/s")
-    return report(f"{name}, ours against the stock environment", rates["ours"] / rates["stock"], 0.75)
-
-
-def iteration(quick: bool) -> bool:
-    """At least 14 times RLlib's default, 25 times with large minibatches; RLlib's best is printed as well."""
-    default, best = "RLlib's default", "RLlib's best (32 environments)"
-    large = f"ours, minibatches of {LARGE_MINIBATCH}"
+def iteration(quick: bool) -> Iterator[Target]:
+    """At least 14 times RLlib's default, 25 times with large minibatches."""
+    large = f"iteration, minibatches of {LARGE_MINIBATCH}"
     algorithms = {
-        "ours": our_ppo(num_envs=32, minibatch_size=MINIBATCH),
+        "iteration": our_ppo(num_envs=32, minibatch_size=MINIBATCH),
         large: our_ppo(num_envs="auto", minibatch_size=LARGE_MINIBATCH),
-        default: rllib_ppo(1),
-        best: rllib_ppo(32),
+        "RLlib's default": rllib_ppo(1),
+        "RLlib's best": rllib_ppo(32),
     }
     for algorithm in algorithms.values():
         algorithm.train()
-    rates = in_rounds(
-        {key: lambda algorithm=algorithm: iteration_rate(algorithm) for key, algorithm in algorithms.items()},
+    seconds = in_rounds(
+        {key: partial(timeit.timeit, algorithm.train, number=1) for key, algorithm in algorithms.items()},
         rounds=1 if quick else 3,
     )
-    for name, rate in rates.items():
-        print(f"{name}: {STEPS / rate:.2f} s per iteration of {STEPS:,} environment steps, {EPOCHS} epochs")
     for algorithm in algorithms.values():
         algorithm.stop()
-    print(f"an iteration, ours against RLlib's best: {rates['ours'] / rates[best]:.1f}x")
-    same = report("an iteration, ours against RLlib's default", rates["ours"] / rates[default], 14.0)
-    return report(f"an iteration, {large}, against RLlib's default", rates[large] / rates[default], 25.0) and same
+    for name, peer, least in (
+        ("iteration", "RLlib's default", 14.0),
+        ("iteration", "RLlib's best", None),
+        (large, "RLlib's default", 25.0),
+    ):
+        note = f"{seconds[name]:.2f} to {seconds[peer]:.2f} s"
+        yield Target(name, seconds[peer] / seconds[name], "×", at_least=least, peer=peer, note=note)
 
 
-def runners(quick: bool) -> bool:
+def runners(quick: bool) -> Iterator[Target]:
     """Two runners sample at least 1.7 times as fast as one."""
-    batch = 9600
     algorithms = {
-        count: build_algorithm(league(SPREAD, runners=count, train_batch_size=batch), interface(league(SPREAD)))
+        count: build_algorithm(league(SPREAD, runners=count, train_batch_size=9600), interface(league(SPREAD)))
         for count in (1, 2)
     }
     rates = in_rounds(
-        {count: lambda algorithm=algorithm: gathering_rate(algorithm) for count, algorithm in algorithms.items()},
+        {count: partial(gathering_rate, algorithm) for count, algorithm in algorithms.items()},
         rounds=5 if quick else 15,
     )
     for algorithm in algorithms.values():
         algorithm.stop()
-    print(f"one runner {rates[1]:,.0f}, two {rates[2]:,.0f} actions/s, in batches of {batch:,}")
-    return report("two runners against one", rates[2] / rates[1], 1.7)
+    yield Target("two runners", rates[2] / rates[1], "×", at_least=1.7, peer="one")
+
+
+def short(entry_point: str) -> str:
+    """The name of an environment without its package and version."""
+    return entry_point.rpartition(".")[2].rpartition("_")[0]
 
 
 def league(entry_point: str, **training: Any) -> LeagueConfig:
@@ -230,101 +222,56 @@ def rllib_ppo(num_envs: int) -> Algorithm:
     return config.build_algo()
 
 
-def in_rounds(measures: Mapping[Any, Callable[[], float]], rounds: int) -> Any:
-    """The median of each measurement over the rounds, in alternation."""
-    found: dict[Any, list[float]] = {key: [] for key in measures}
-    for _ in range(rounds):
-        for key, measure in measures.items():
-            found[key].append(measure())
-    return {key: statistics.median(values) for key, values in found.items()}
-
-
 def sampling_rate(runner: EnvRunner, entry_point: str, seconds: float) -> float:
     """Environment steps per second, including episodes for a learner. RLlib counts steps, our runner counts actions."""
     is_ours = isinstance(runner, BatchedEnvRunner)
     sample, share = (runner.sample_chunks, AGENTS[entry_point]) if is_ours else (runner.sample, 1)
     size = max(1024, 16 * runner.config.num_envs_per_env_runner)
-    steps, began = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - began) < seconds:
+
+    def step() -> float:
         sample(num_timesteps=size * share)
-        steps += size
-    return steps / elapsed
+        return size
+
+    return rate(step, seconds)
 
 
 def in_parallel(module: Any, seconds: float) -> float:
     """Steps per second of the unmodified `parallel_env()`, with random actions."""
-    env, rng, steps = module.parallel_env(), np.random.default_rng(0), 0
-    spaces = {agent: int(env.action_space(agent).n) for agent in env.possible_agents}
-    began = time.perf_counter()
-    while (elapsed := time.perf_counter() - began) < seconds:
+    env, rng = module.parallel_env(), np.random.default_rng(0)
+    sizes = {agent: int(env.action_space(agent).n) for agent in env.possible_agents}
+
+    def episode() -> int:
         env.reset()
+        steps = 0
         while env.agents:
-            env.step({agent: int(rng.integers(spaces[agent])) for agent in env.agents})
+            env.step({agent: int(rng.integers(sizes[agent])) for agent in env.agents})
             steps += 1
-    return steps / elapsed
+        return steps
+
+    return rate(episode, seconds)
 
 
 def in_turns(module: Any, seconds: float) -> float:
     """Moves per second of the unmodified `env()`, with random legal actions, in PettingZoo's loop."""
-    env, rng, moves = module.env(), np.random.default_rng(0), 0
-    began = time.perf_counter()
-    while (elapsed := time.perf_counter() - began) < seconds:
-        env.reset()
-        for _ in env.agent_iter():
-            observation, _, terminated, truncated, _ = env.last()
-            if terminated or truncated:
-                env.step(None)
-            else:
-                env.step(int(rng.choice(np.flatnonzero(observation["action_mask"]))))
-                moves += 1
-    return moves / elapsed
-
-
-def iteration_rate(algorithm: Algorithm) -> float:
-    """Environment steps per second of one iteration, including learning."""
-    began = time.perf_counter()
-    algorithm.train()
-    return STEPS / (time.perf_counter() - began)
+    env, rng = module.env(), np.random.default_rng(0)
+    return rate(lambda: play_game(env, lambda _, mask: int(rng.choice(np.flatnonzero(mask)))), seconds)
 
 
 def gathering_rate(algorithm: PPO) -> float:
     """Actions per second until a batch has arrived from all runners."""
     began = time.perf_counter()
     chunks, _ = algorithm.sample_train_batch()
-    return sum(int(own.lengths.sum()) for own in chunks) / (time.perf_counter() - began)
+    return sum(int(chunk.lengths.sum()) for chunk in chunks) / (time.perf_counter() - began)
 
 
-def report(what: str, ratio: float, target: float) -> bool:
-    """Print a ratio with its target; returns whether it is met."""
-    print(f"{what}: {ratio:.2f}x (target {target:g}x){'' if ratio >= target else '  BELOW TARGET'}", flush=True)
-    return ratio >= target
-
-
-PARTS: dict[str, Callable[[bool], bool]] = {
+PARTS: dict[str, Callable[[bool], Iterator[Target]]] = {
     part.__name__: part for part in (simple_spread, connect_four, stock, iteration, runners)
 }
 
 
-def main() -> int:
-    """Run the requested parts; 1 if a target is missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
-    parser.add_argument("--quick", action="store_true", help="shorter measurements")
-    options = parser.parse_args()
-    if unknown := [part for part in options.parts if part not in PARTS]:
-        parser.error(f"no part {', '.join(unknown)}: expected some of {', '.join(PARTS)}")
-    logging.disable(logging.WARNING)
-    warnings.simplefilter("ignore")
-    ray.init(address="local", num_cpus=4, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+def main(parts: Parts = None, quick: Quick = False) -> Iterator[Target]:
+    """Measure the parts."""
     torch.set_num_threads(1)
-    missed = []
-    for name in options.parts or PARTS:
-        print(f"\n-- {name} --", flush=True)
-        if not PARTS[name](options.quick):
-            missed.append(name)
-    print(f"\nmissed: {', '.join(missed)}" if missed else "\nall met")
-    return bool(missed)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    with local_ray(cpus=4):
+        for part in chosen(parts, PARTS).values():
+            yield from part(quick)

@@ -13,12 +13,10 @@ it says nothing about waiting, but hardly depends on what else runs on the machi
 ONNX Runtime, answer with the action only, and are installed into a cache folder.
 """
 
-import argparse
 import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
@@ -27,12 +25,15 @@ from functools import partial
 from math import nan
 from pathlib import Path
 from statistics import median
+from typing import Annotated
 
 import httpx
 import psutil
+import typer
 import yaml
 
-from benchmarks.leagues.served_league import BODY, LEAGUE, PLANES, publish
+from benchmarks.harness import ROOT, Quick, Target
+from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES, published
 from benchmarks.load.http import measure
 from benchmarks.peers.frameworks import CACHE, FRAMEWORKS, Framework
 from benchmarks.peers.rllib_server import save_module
@@ -41,7 +42,6 @@ from league.settings import Storage
 from serve_app.runtime import haproxy
 from serve_app.runtime.launch import DEPLOY_YAML, running
 
-ROOT = Path(__file__).parent.parent
 CONNECTIONS = 32
 START_TIMEOUT = 180.0
 AT_LEAST = {
@@ -93,7 +93,7 @@ class ServerUnderTest:
     @property
     def summary(self) -> str:
         rates = ", ".join(
-            f"{median(each[count] for each in self.rates):,.0f}/s at {count}" for count in self.connections
+            f"{median(of_round[count] for of_round in self.rates):,.0f}/s at {count}" for count in self.connections
         )
         failed = f", {self.failed} failed" if self.failed else ""
         cost = f"{median(self.costs):.0f} µs of processor time per request"
@@ -102,65 +102,58 @@ class ServerUnderTest:
 
 def _processor_seconds() -> dict[int, float]:
     """Processor time of each process that this one, or one of its own, has started."""
-    found = {}
+    seconds = {}
     for process in psutil.Process().children(recursive=True):
         with suppress(psutil.NoSuchProcess):
             times = process.cpu_times()
-            found[process.pid] = times.user + times.system
-    return found
+            seconds[process.pid] = times.user + times.system
+    return seconds
 
 
-def main() -> int:
-    """Print each server and the ratios; 1 if one is below its target."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--quick", action="store_true", help="smoke test: one short round")
-    parser.add_argument("--peers", action="store_true", help="compare with LitServe, MLServer and BentoML")
-    parser.add_argument("--cache", type=Path, default=CACHE, help="where they are installed (default: %(default)s)")
-    options = parser.parse_args()
-    rounds, seconds = (1, 2.0) if options.quick else (options.rounds, options.seconds)
-    with tempfile.TemporaryDirectory() as scratch:
-        storage = publish(Path(scratch) / "home", versions=1).storage
-        make = partial(_frameworks, cache=options.cache) if options.peers else _servers
-        servers = make(storage, Path(scratch))
+def main(
+    quick: Quick = False,
+    rounds: int = 3,
+    seconds: float = 5.0,
+    peers: Annotated[bool, typer.Option("--peers", help="compare with LitServe, MLServer and BentoML")] = False,
+    cache: Annotated[Path, typer.Option(help="where they are installed")] = CACHE,
+) -> Iterator[Target]:
+    """Measure the servers in rounds, and compare ours with the others."""
+    rounds, seconds = (1, 2.0) if quick else (rounds, seconds)
+    with published() as registry:
+        scratch = registry.storage.home.parent
+        servers = _frameworks(registry.storage, scratch, cache) if peers else _servers(registry.storage, scratch)
         for number in range(rounds):
             for server in servers.values():
                 server.measure(seconds)
                 print(f"after round {number + 1}: {server.name}: {server.summary}", flush=True)
-    print()
-    for server in servers.values():
-        print(f"{server.name}: {server.summary}")
-    assert not servers["ours"].failed, "an action was not answered"
-    met = [_compare(servers["ours"], servers[peer], AT_LEAST[peer]) for peer in servers if peer in AT_LEAST]
-    return int(not all(met) or ("handler" in servers and not _is_as_fast(servers)))
+    ours = servers["ours"]
+    assert not ours.failed, "an action was not answered"
+    for key, server in servers.items():
+        rate = round(median(server.best(number) for number in range(rounds)))
+        yield Target(server.name, rate, "/s", note=server.summary)
+        if key in AT_LEAST:
+            yield _compare(ours, server, AT_LEAST[key])
+    if (handler := servers.get("handler")) is not None:
+        slower = median(ours_p50 - bare for ours_p50, bare in zip(ours.latencies, handler.latencies, strict=True))
+        yield Target("p50 with one connection", round(slower, 2), "ms", at_most=SLOWER_BY, peer="bare uvicorn")
 
 
-def _is_as_fast(servers: dict[str, ServerUnderTest]) -> bool:
-    """Compare the latency with that of the same handler on uvicorn."""
-    pairs = zip(servers["ours"].latencies, servers["handler"].latencies, strict=True)
-    slower = median(own - other for own, other in pairs)
-    print(f"p50 with one connection over bare uvicorn's: {slower:+.2f} ms   (at most {SLOWER_BY:+g} ms)")
-    return slower <= SLOWER_BY
-
-
-def _compare(ours: ServerUnderTest, peer: ServerUnderTest, least: float | None) -> bool:
+def _compare(ours: ServerUnderTest, peer: ServerUnderTest, least: float | None) -> Target:
     ratio = median(ours.best(number) / (peer.best(number) or nan) for number in range(len(ours.rates)))
-    cheaper = median(other / own for own, other in zip(ours.costs, peer.costs, strict=True))
-    target = "" if least is None else f"   (at least {least:g}×)"
-    print(f"ours / {peer.name}: {ratio:.2f}×{target}, with 1/{cheaper:.2f} of its processor time per request")
-    return least is None or not ratio < least
+    cheaper = median(theirs / cost for cost, theirs in zip(ours.costs, peer.costs, strict=True))
+    note = f"processor time per request 1/{cheaper:.2f}"
+    return Target("one replica", ratio, "×", at_least=least, peer=peer.name, note=note)
 
 
 def _frameworks(storage: Storage, scratch: Path, cache: Path) -> dict[str, ServerUnderTest]:
     """Our server, FastAPI, and the frameworks of `benchmarks.peers.frameworks`."""
     with closing(Registry.open(storage)) as registry:
         (graph,) = registry.artifacts.path(LEAGUE, 1).glob("*.onnx")
-    for each in FRAMEWORKS:
-        each.python(cache)
+    for peer in FRAMEWORKS:
+        peer.python(cache)
     return _own_and_fastapi(storage) | {
-        each.name: ServerUnderTest(each.requirements[0], partial(_framework, each, graph, cache, scratch), each.body)
-        for each in FRAMEWORKS
+        peer.name: ServerUnderTest(peer.requirements[0], partial(_framework, peer, graph, cache, scratch), peer.body)
+        for peer in FRAMEWORKS
     }
 
 
@@ -203,7 +196,7 @@ def _framework(framework: Framework, graph: Path, cache: Path, scratch: Path) ->
 @contextmanager
 def _ours(storage: Storage, replicas: int) -> Iterator[str]:
     with running(storage, replicas=replicas) as url:
-        yield f"{url}/v1/policies/{LEAGUE}/action"
+        yield url + ACTION
 
 
 @contextmanager
@@ -215,7 +208,7 @@ def _constant(storage: Storage, scratch: Path, factory: str) -> Iterator[str]:
     deploy = scratch / "constant.yaml"
     deploy.write_text(yaml.safe_dump(document))
     with running(storage, replicas=1, deploy=deploy) as url:
-        yield f"{url}/v1/policies/{LEAGUE}/action"
+        yield url + ACTION
 
 
 @contextmanager
@@ -224,7 +217,7 @@ def _bare(kind: str, storage: Storage) -> Iterator[str]:
     command = [sys.executable, "-m", "benchmarks.peers.bare_servers", kind, str(storage.home), str(port)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, env=environment) as server:
-        url = f"http://127.0.0.1:{port}/v1/policies/{LEAGUE}/action"
+        url = f"http://127.0.0.1:{port}{ACTION}"
         assert server.stdin is not None
         try:
             _await(url, server)
@@ -247,10 +240,7 @@ def _await(url: str, server: "subprocess.Popen[bytes]", body: bytes = BODY) -> N
 
 @contextmanager
 def _tuned(checkpoint: Path) -> Iterator[str]:
-    with (
-        haproxy.private_directory() as directory,
-        _rllib_server(checkpoint, haproxy.environment(directory)) as url,
-    ):
+    with haproxy.private_directory() as directory, _rllib_server(checkpoint, haproxy.environment(directory)) as url:
         yield url
 
 
@@ -274,7 +264,3 @@ def _rllib_server(checkpoint: Path, environment: dict[str, str]) -> Iterator[str
             yield f"http://127.0.0.1:{port}/rllib-rlmodule"
         finally:
             server.stdin.close()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,62 +5,47 @@ the server: the median latency with all requests mirrored to the candidate divid
 of runs, of which the median counts.
 """
 
-import argparse
-import sys
-import tempfile
-import time
-from pathlib import Path
+from collections.abc import Iterator
 from statistics import median
 
-from benchmarks.leagues.served_league import BODY, LEAGUE, publish
+from benchmarks.harness import Quick, Target
+from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, served
 from benchmarks.load.http import measure
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
-from serve_app.runtime.launch import running
+from tests.support.waiting import until
 
 CLIENTS = 8
 REPLICAS = 2
 SLOWER = 1.1
 
 
-def main() -> int:
-    """Print the pairs; 1 if the target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--quick", action="store_true", help="smoke test: one short pair")
-    options = parser.parse_args()
-    pairs, seconds = (1, 2.0) if options.quick else (options.pairs, options.seconds)
+def main(quick: Quick = False, pairs: int = 5, seconds: float = 8.0) -> Iterator[Target]:
+    """Measure the pairs."""
+    pairs, seconds = (1, 2.0) if quick else (pairs, seconds)
     ratios = []
-    with tempfile.TemporaryDirectory() as scratch:
-        registry = publish(Path(scratch) / "home", versions=2)
-        with running(registry.storage, replicas=REPLICAS) as url:
-            address = f"{url}/v1/policies/{LEAGUE}/action"
-            rate = measure(address, BODY, connections=32, seconds=seconds / 2).rate / 2
-            for number in range(pairs):
-                _shadow(registry, None)
-                alone = measure(address, BODY, connections=CLIENTS, seconds=seconds, rate=rate)
-                _shadow(registry, Portion(2, 1.0))
-                shadowed = measure(address, BODY, connections=CLIENTS, seconds=seconds, rate=rate)
-                ratios.append(shadowed.p50 / alone.p50)
-                print(f"pair {number + 1}, {rate:,.0f}/s: p50 {alone.p50:.3f} ms without a shadow, ", end="")
-                print(f"{shadowed.p50:.3f} ms with one: {ratios[-1]:.2f}×", flush=True)
-            _report(registry)
-        registry.close()
-    print(f"p50 with a shadow of all requests over without: {median(ratios):.2f}×   (at most {SLOWER:g}×)")
-    return int(median(ratios) > SLOWER)
+    with served(2, replicas=REPLICAS) as (url, registry):
+        rate = measure(url + ACTION, BODY, connections=32, seconds=seconds / 2).rate / 2
+        for _ in range(pairs):
+            p50 = []
+            for shadow in (None, Portion(2, 1.0)):
+                _shadow(registry, shadow)
+                p50.append(measure(url + ACTION, BODY, connections=CLIENTS, seconds=seconds, rate=rate).p50)
+            ratios.append(p50[1] / p50[0])
+        _report(registry)
+    note = f"{rate:,.0f}/s; pairs {', '.join(f'{ratio:.2f}' for ratio in ratios)}"
+    yield Target("p50 with a shadow", median(ratios), "×", at_most=SLOWER, peer="without", note=note)
 
 
 def _shadow(registry: Registry, shadow: Portion | None) -> None:
     """Set the shadow; returns when all replicas follow."""
     setting = registry.traffic.set(LEAGUE, shadow=shadow, actor="benchmark", reason="a pair")
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline:
-        said = registry.replicas.acknowledgements(LEAGUE)
-        if len(said) >= REPLICAS and all(one.traffic == setting.id for one in said):
-            return
-        time.sleep(0.02)
-    raise TimeoutError("the replicas do not follow within 30 s")
+
+    def follows() -> bool:
+        rows = registry.replicas.acknowledgements(LEAGUE)
+        return len(rows) >= REPLICAS and all(row.traffic == setting.id for row in rows)
+
+    until(follows, 30)
 
 
 def _report(registry: Registry) -> None:
@@ -69,7 +54,3 @@ def _report(registry: Registry) -> None:
     offered = counts.requests + counts.dropped
     print(f"of {offered:,} requests {counts.requests:,} were computed by the candidate, ", end="")
     print(f"{counts.dropped:,} were dropped ({counts.dropped / offered:.0%}); agreement {counts.agreement:.1%}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,9 +1,7 @@
 """Start-up time of the command line: `league --help`, and `league versions` of a league without games.
 
-    python -m benchmarks.startup [--against CHECKOUT] [--quick]
-
-Prints the minimum wall and CPU time of 10 runs (--quick: 3), so that other processes affect it little. With --against,
-runs alternate between this code and another checkout with the same dependencies, each with a home of its own.
+The minimum of the wall times of 10 runs, and that of the CPU times, so that other processes affect them little. With
+--against, runs alternate between this code and another checkout with the same dependencies, each with its own home.
 """
 
 import os
@@ -12,10 +10,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Annotated
 
-HERE = Path(__file__).parents[1]
+import typer
+
+from benchmarks.harness import ROOT, Quick, Target
+
 TARGETS = {"--help": 0.25, "versions rps": 0.6}
 """Seconds on an idle core."""
 COMMAND = [sys.executable, "-c", "import sys; from policy_league.cli.main import run; sys.exit(run())"]
@@ -33,18 +35,20 @@ register(config, interface(config))
 """
 
 
-def main() -> None:
-    repeats = 3 if "--quick" in sys.argv else 10
-    checkouts = [HERE]
-    if "--against" in sys.argv:
-        checkouts.append(Path(sys.argv[sys.argv.index("--against") + 1]))
+def main(
+    quick: Quick = False, against: Annotated[Path | None, typer.Option(help="another checkout")] = None
+) -> Iterator[Target]:
+    """Time both commands."""
     with tempfile.TemporaryDirectory() as directory:
+        checkouts = [ROOT, *([against] if against else [])]
         environments = [_environment(checkout, Path(directory) / str(i)) for i, checkout in enumerate(checkouts)]
-        for arguments, target in TARGETS.items():
-            runs = [[_run(arguments, each) for each in environments] for _ in range(repeats)]
-            best = [[min(times) for times in zip(*of_checkout, strict=True)] for of_checkout in zip(*runs, strict=True)]
-            shown = [f"{wall:.2f} s, CPU {cpu:.2f} s" for wall, cpu in best]
-            print(f"league {arguments}: {' against '.join(shown)} (target: {target} s)")
+        for arguments, limit in TARGETS.items():
+            runs = [[_run(arguments, environment) for environment in environments] for _ in range(3 if quick else 10)]
+            (wall, cpu), *other = (
+                [min(times) for times in zip(*checkout, strict=True)] for checkout in zip(*runs, strict=True)
+            )
+            note = f"CPU {cpu:.2f} s" + "".join(f"; {against}: {wall:.2f} s, CPU {cpu:.2f} s" for wall, cpu in other)
+            yield Target(f"league {arguments}", round(wall, 3), "s", at_most=limit, note=note)
 
 
 def _environment(checkout: Path, home: Path) -> dict[str, str]:
@@ -64,7 +68,3 @@ def _run(arguments: str, environment: Mapping[str, str]) -> tuple[float, float]:
     subprocess.run(command, env=environment, cwd="/", check=True, stdout=subprocess.DEVNULL)
     wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
-if __name__ == "__main__":
-    main()

@@ -7,13 +7,9 @@ environment, without the checking wrappers. Rates are environment steps per seco
 core; the two alternate within a round, and a rate is the median over the rounds.
 """
 
-import argparse
 import logging
 import os
 import random
-import statistics
-import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -30,6 +26,8 @@ from pettingzoo.butterfly.pistonball import pistonball
 from pettingzoo.classic import connect_four_v3, leduc_holdem_v4, tictactoe_v3
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 
+from benchmarks.harness import Quick, Target, in_rounds, rate
+from benchmarks.stock import moves
 from league.config.environment import EnvironmentConfig
 from league.environments.building import build, observation_space
 from league.environments.implementation import stepping
@@ -55,41 +53,25 @@ class Case:
     target: float
 
 
-def main() -> int:
-    """Print rates and ratios; 1 if a ratio is below its target."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="shorter measurements")
-    quick = parser.parse_args().quick
+def main(quick: Quick = False) -> Iterator[Target]:
+    """Measure all environments."""
     logging.disable(logging.WARNING)
     warnings.simplefilter("ignore")
-    failed = 0
-    print(f"{'':>28} {'ours':>9} {'stock':>9}   steps/s")
     for name, case in CASES.items():
-        ours, stock = measure(case, rounds=3 if quick else 9, seconds=0.4 if quick else 1.0)
-        ratio = ours / stock
-        failed |= ratio < case.target
-        note = "" if ratio >= case.target else "  BELOW TARGET"
-        print(f"{name:>28} {ours:>9,.0f} {stock:>9,.0f}   {ratio:.2f}x (target {case.target:g}x){note}", flush=True)
-    return int(failed)
+        rates = measure(case, rounds=3 if quick else 9, seconds=0.4 if quick else 1.0)
+        note = f"{rates['ours']:,.0f} to {rates['stock']:,.0f} steps/s"
+        yield Target(name, rates["ours"] / rates["stock"], "×", at_least=case.target, peer="stock", note=note)
 
 
-def measure(case: Case, rounds: int, seconds: float) -> tuple[float, float]:
+def measure(case: Case, rounds: int, seconds: float) -> dict[str, float]:
     """Steps per second of our and of the unmodified environment."""
     ours, stock = batched(case.config, case.num_envs), case.stock()
-    rates: tuple[list[float], list[float]] = ([], [])
-    for _ in range(rounds + 1):
-        for found, steps, each in zip(rates, (ours, stock), (case.num_envs, 1), strict=True):
-            found.append(each * rate(steps, seconds))
-    return statistics.median(rates[0][1:]), statistics.median(rates[1][1:])  # the first round is a warm-up
-
-
-def rate(steps: Iterator[None], seconds: float) -> float:
-    """Items of an iterator per second."""
-    taken, began = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - began) < seconds:
-        next(steps)
-        taken += 1
-    return taken / elapsed
+    measures = {
+        "ours": lambda: rate(lambda: next(ours) or case.num_envs, seconds),
+        "stock": lambda: rate(lambda: next(stock) or 1, seconds),
+    }
+    in_rounds(measures, 1)  # a warm-up
+    return in_rounds(measures, rounds)
 
 
 def batched(config: EnvironmentConfig, num_envs: int) -> Iterator[None]:
@@ -122,14 +104,7 @@ def masked(batch: Batch, rng: np.random.Generator) -> Any:
 def aec_loop(env: Any) -> Iterator[None]:
     """PettingZoo's loop for a game with masks."""
     while True:
-        env.reset()
-        for _ in env.agent_iter():
-            observation, _, terminated, truncated, _ = env.last()
-            if terminated or truncated:
-                env.step(None)
-                continue
-            env.step(random.choice(np.flatnonzero(observation[ACTION_MASK]).tolist()))
-            yield
+        yield from moves(env, lambda _, observation: random.choice(np.flatnonzero(observation[ACTION_MASK]).tolist()))
 
 
 def parallel_loop(env: Any, act: Callable[[], Any]) -> Iterator[None]:
@@ -202,7 +177,3 @@ CASES = {
         1.5,
     ),
 }
-
-
-if __name__ == "__main__":
-    sys.exit(main())

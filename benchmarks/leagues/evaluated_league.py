@@ -50,7 +50,7 @@ def _builder(row: LeagueRow, module: ActorCritic, seed: int) -> Callable[[Path, 
 
     def build(directory: Path, number: int) -> Manifest:
         export_policy(module, spaces, directory / f"{policy}.onnx")
-        taken, answered, state = graph_tensors(module, spaces)
+        inputs, outputs, state = graph_tensors(module, spaces)
         return Manifest(
             league=row.slug,
             version=number,
@@ -61,8 +61,8 @@ def _builder(row: LeagueRow, module: ActorCritic, seed: int) -> Callable[[Path, 
                     file=f"{policy}.onnx",
                     observation=spaces.observation,
                     action=spaces.action,
-                    inputs=taken,
-                    outputs=answered,
+                    inputs=inputs,
+                    outputs=outputs,
                     state=state,
                     parity=Parity(observations=0, mismatches=0, near_ties=0, max_difference=0.0),
                 )

@@ -4,15 +4,19 @@ import contextlib
 import io
 import json
 import logging
+import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from torch import Tensor, nn
 
+from benchmarks.harness import CONFIGS
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.interface import AgentInterface
@@ -20,11 +24,13 @@ from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest, Parity, PolicyManifest
 from league.registry.storage.manifest import Tensor as TensorManifest
+from league.registry.storage.rows import AliasEvent
 from league.settings import Storage
 from league.spaces import inputs
+from serve_app.runtime.launch import DEPLOY_YAML, running
 
-ROOT = Path(__file__).parents[2]
 LEAGUE = "connect_four"
+ACTION = f"/v1/policies/{LEAGUE}/action"
 HIDDEN = (256, 256)
 PLANES = np.random.default_rng(0).integers(0, 2, (6, 7, 2), dtype=np.int8)
 BODY = json.dumps({"observation": {"observation": PLANES.tolist(), "action_mask": [1] * 7}}).encode()
@@ -53,13 +59,47 @@ def publish(home: Path, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Regi
     return fill(Registry.open(Storage.at(home)), versions, hidden)
 
 
+@contextlib.contextmanager
+def published(versions: int = 1, hidden: tuple[int, ...] = HIDDEN) -> Iterator[Registry]:
+    """The registry of `publish` in a temporary directory."""
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        contextlib.closing(publish(Path(scratch) / "home", versions, hidden)) as registry,
+    ):
+        yield registry
+
+
+@contextlib.contextmanager
+def served(
+    versions: int = 1,
+    *,
+    hidden: tuple[int, ...] = HIDDEN,
+    change: Callable[[dict[str, Any]], object] | None = None,
+    **options: Any,
+) -> Iterator[tuple[str, Registry]]:
+    """A server of the league, and its registry. change: changes the document deploy.yaml. options: of `running`."""
+    with published(versions, hidden) as registry:
+        deploy = registry.storage.home.with_name("deploy.yaml")
+        document = yaml.safe_load(DEPLOY_YAML.read_text())
+        if change is not None:
+            change(document)
+        deploy.write_text(yaml.safe_dump(document))
+        with running(registry.storage, deploy=deploy, **options) as url:
+            yield url, registry
+
+
+def promote(registry: Registry, version: int) -> AliasEvent:
+    """Make a version the champion."""
+    return registry.aliases.set(LEAGUE, "champion", version, expected=ANY, actor="benchmark", reason="a measurement")
+
+
 def fill(registry: Registry, versions: int, hidden: tuple[int, ...] = HIDDEN) -> Registry:
     """The registry, with the league of `publish`."""
-    config = LeagueConfig.load(ROOT / "policy_league/configs" / "connect_four.yaml")
+    config = LeagueConfig.load(CONFIGS / "connect_four.yaml")
     registry.leagues.register(config, interface(config))
     for seed in range(versions):
         registry.publisher.publish(LEAGUE, builder(registry, seed, hidden), source=f"random/{seed}")
-    registry.aliases.set(LEAGUE, "champion", 1, expected=ANY, actor="benchmark", reason="something must answer")
+    promote(registry, 1)
     return registry
 
 

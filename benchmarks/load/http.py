@@ -1,24 +1,20 @@
 """A lightweight HTTP/1.1 load generator: raw sockets, keep-alive, one request in flight per connection.
 
-`python -m benchmarks.load.http URL --connections 32 --seconds 5 < body.json` prints one line of JSON (a `Load`). It is
-a separate process, so that it does not share an interpreter with the measured server; each request costs it a few
-microseconds.
+Each request costs it a few microseconds.
 """
 
-import argparse
 import asyncio
-import json
-import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from random import random
 from typing import cast
 from urllib.parse import urlsplit
 
 import numpy as np
+
+from benchmarks.load.elsewhere import run_elsewhere
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +162,11 @@ async def run(
     stop = start + seconds
 
     def on_reply(status: int, _: bytes, sent_at: float) -> bool:
-        now = time.perf_counter()
-        if start <= now <= stop:
+        replied_at = time.perf_counter()
+        if start <= replied_at <= stop:
             statuses[str(status)] += 1
-            latencies.append(now - sent_at)
-        return now < stop
+            latencies.append(replied_at - sent_at)
+        return replied_at < stop
 
     await drive(url, body, connections, on_reply, lambda: time.perf_counter() < stop, rate=rate, headers=headers)
     times = np.array(latencies or [np.nan]) * 1e3
@@ -191,39 +187,5 @@ def measure(
     rate: float = 0.0,
     headers: Mapping[str, str] = JSON,
 ) -> Load:
-    """Run the generator in a subprocess."""
-    command = [sys.executable, "-m", "benchmarks.load.http", url]
-    command += ["--connections", str(connections), "--seconds", str(seconds), "--warm-up", str(warm_up)]
-    command += ["--rate", str(rate), "--headers", json.dumps(dict(headers))]
-    done = subprocess.run(command, input=body, stdout=subprocess.PIPE, check=True)
-    return Load(**json.loads(done.stdout))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("url")
-    parser.add_argument("--connections", type=int, default=32)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--warm-up", type=float, default=1.0)
-    parser.add_argument("--rate", type=float, default=0.0, help="requests per second; 0: as fast as they are answered")
-    parser.add_argument("--headers", type=json.loads, default=JSON, help="as a JSON object")
-    options = parser.parse_args()
-    import uvloop
-
-    body = sys.stdin.buffer.read()
-    load = uvloop.run(
-        run(
-            options.url,
-            body,
-            options.connections,
-            options.seconds,
-            options.warm_up,
-            options.rate,
-            options.headers,
-        )
-    )
-    print(json.dumps(asdict(load)))
-
-
-if __name__ == "__main__":
-    main()
+    """Run the generator in a process of its own."""
+    return run_elsewhere(run, url, body, connections, seconds, warm_up, rate, dict(headers))

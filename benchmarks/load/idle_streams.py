@@ -1,21 +1,12 @@
-"""Many WebSocket streams that send nothing: each answers pings, and connects again after it was closed.
+"""Many WebSocket streams that send nothing: each answers pings, and connects again after it was closed."""
 
-`python -m benchmarks.load.idle_streams URL --streams 10000` prints a line as soon as all are open. At the end of its
-standard input it closes them, and prints one line of JSON (an `IdleStreams`).
-"""
-
-import argparse
 import asyncio
-import json
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import cast
 from urllib.parse import urlsplit
 
+from benchmarks.load.elsewhere import Stage
 from benchmarks.load.websocket import FINAL, HANDSHAKE, MASKED, NO_MASK, frame_length
 
 CLOSE, PING, PONG = 0x8, 0x9, 0xA
@@ -83,11 +74,11 @@ class _IdleStream(asyncio.Protocol):
         self._transport.abort()
 
 
-async def run(url: str, number: int) -> IdleStreams:
-    """Hold streams until the end of the standard input."""
+async def run(stage: Stage, url: str, number: int) -> IdleStreams:
+    """Hold streams until the stage is over."""
     parts = urlsplit(url)
     handshake = HANDSHAKE.format(path=f"{parts.path}?{parts.query}", host=parts.netloc).encode()
-    seen, turns, loop = IdleStreams(), asyncio.Semaphore(AT_ONCE), asyncio.get_running_loop()
+    record, turns, loop = IdleStreams(), asyncio.Semaphore(AT_ONCE), asyncio.get_running_loop()
     began: float | None = None
 
     async def connect() -> _IdleStream:
@@ -99,53 +90,21 @@ async def run(url: str, number: int) -> IdleStreams:
                         return stream
                 except OSError:
                     pass
-            seen.refused += 1
+            record.refused += 1
             await asyncio.sleep(RETRY)
 
     async def hold(stream: _IdleStream) -> None:
         while True:
             code = await stream.closed
-            seen.codes[code] = seen.codes.get(code, 0) + 1
-            seen.closed.append(time.monotonic() - (began or time.monotonic()))
+            record.codes[code] = record.codes.get(code, 0) + 1
+            record.closed.append(time.monotonic() - (began or time.monotonic()))
             stream = await connect()
 
     streams = await asyncio.gather(*(connect() for _ in range(number)))
     began = time.monotonic()
-    print("open", flush=True)
+    stage.ready()
     holding = [asyncio.create_task(hold(stream)) for stream in streams]
-    await asyncio.to_thread(sys.stdin.read)
+    await stage.over()
     for task in holding:
         task.cancel()
-    return seen
-
-
-@contextmanager
-def holding(url: str, number: int) -> Iterator[IdleStreams]:
-    """Hold idle streams in a subprocess while the context is active; what they saw is complete after it."""
-    command = [sys.executable, "-m", "benchmarks.load.idle_streams", url, "--streams", str(number)]
-    seen = IdleStreams()
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdin is not None
-        if not process.stdout.readline():
-            raise RuntimeError("the streams were not opened")
-        try:
-            yield seen
-        finally:
-            process.stdin.close()
-            for name, value in json.loads(process.stdout.readline()).items():
-                setattr(seen, name, value)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("url")
-    parser.add_argument("--streams", type=int, default=1000)
-    options = parser.parse_args()
-    import uvloop
-
-    print(json.dumps(asdict(uvloop.run(run(options.url, options.streams)))))
-
-
-if __name__ == "__main__":
-    main()
+    return record

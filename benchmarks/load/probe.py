@@ -1,21 +1,15 @@
 """How long does a server keep a caller waiting? Requests on new connections at a steady rate, without waiting for the
 responses of earlier ones.
-
-`python -m benchmarks.load.probe URL --seconds 5 < body.json` prints one line of JSON (a `Probe`). It is a separate
-process, as benchmarks.load.http is.
 """
 
-import argparse
 import asyncio
-import json
-import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from urllib.parse import urlsplit
 
+from benchmarks.load.elsewhere import run_elsewhere
 from benchmarks.load.http import JSON, post
 
 INTERVAL = 0.02
@@ -68,22 +62,5 @@ async def run(url: str, body: bytes, seconds: float, headers: Mapping[str, str])
 
 
 def measure(url: str, body: bytes, seconds: float, headers: Mapping[str, str] = JSON) -> Probe:
-    """Run the probe in a subprocess."""
-    command = [sys.executable, "-m", "benchmarks.load.probe", url, "--seconds", str(seconds)]
-    command += ["--headers", json.dumps(dict(headers))]
-    return Probe(**json.loads(subprocess.run(command, input=body, stdout=subprocess.PIPE, check=True).stdout))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("url")
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--headers", type=json.loads, default=JSON, help="as a JSON object")
-    options = parser.parse_args()
-    import uvloop
-
-    print(json.dumps(asdict(uvloop.run(run(options.url, sys.stdin.buffer.read(), options.seconds, options.headers)))))
-
-
-if __name__ == "__main__":
-    main()
+    """Run the probe in a process of its own."""
+    return run_elsewhere(run, url, body, seconds, dict(headers))

@@ -1,23 +1,20 @@
 """A lightweight WebSocket load generator: raw sockets, one message in flight per stream.
 
-`python -m benchmarks.load.websocket URL --streams 16 --seconds 5 < message` prints one line of JSON (a `StreamLoad`).
 Frames are masked with zeros, which RFC 6455 allows and which costs the client nothing; the server must unmask them
 nevertheless.
 """
 
-import argparse
 import asyncio
-import json
 import struct
-import subprocess
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import cast
 from urllib.parse import urlsplit
 
 import numpy as np
+
+from benchmarks.load.elsewhere import run_elsewhere
 
 TEXT, BINARY = 1, 2
 FINAL, MASKED = 0x80, 0x80
@@ -124,11 +121,11 @@ async def run(url: str, message: bytes, is_text: bool, streams: int, seconds: fl
 
     def on_answer(answered: int, sent_at: float) -> bool:
         nonlocal failures
-        now = time.perf_counter()
-        if start <= now <= stop:
-            latencies.append(now - sent_at)
+        answered_at = time.perf_counter()
+        if start <= answered_at <= stop:
+            latencies.append(answered_at - sent_at)
             failures += answered != opcode
-        return now < stop
+        return answered_at < stop
 
     loop = asyncio.get_running_loop()
     connections = [
@@ -149,27 +146,5 @@ async def run(url: str, message: bytes, is_text: bool, streams: int, seconds: fl
 def measure(
     url: str, message: bytes, *, is_text: bool, streams: int, seconds: float, warm_up: float = 1.0
 ) -> StreamLoad:
-    """Run the generator in a subprocess."""
-    command = [sys.executable, "-m", "benchmarks.load.websocket", url, "--streams", str(streams)]
-    command += ["--seconds", str(seconds), "--warm-up", str(warm_up), *(["--text"] if is_text else [])]
-    done = subprocess.run(command, input=message, stdout=subprocess.PIPE, check=True)
-    return StreamLoad(**json.loads(done.stdout))
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("url")
-    parser.add_argument("--text", action="store_true", help="send text; by default binary")
-    parser.add_argument("--streams", type=int, default=16)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--warm-up", type=float, default=1.0)
-    options = parser.parse_args()
-    import uvloop
-
-    message = sys.stdin.buffer.read()
-    load = uvloop.run(run(options.url, message, options.text, options.streams, options.seconds, options.warm_up))
-    print(json.dumps(asdict(load)))
-
-
-if __name__ == "__main__":
-    main()
+    """Run the generator in a process of its own."""
+    return run_elsewhere(run, url, message, is_text, streams, seconds, warm_up)

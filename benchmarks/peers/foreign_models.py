@@ -43,8 +43,8 @@ class BoardNetwork(nn.Module):
         self.policy_head, self.value_head = nn.Linear(64, 7), nn.Linear(64, 1)
 
     def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
-        found = torch.relu(self.body(planes))
-        return self.policy_head(found), torch.tanh(self.value_head(found))
+        features = torch.relu(self.body(planes))
+        return self.policy_head(features), torch.tanh(self.value_head(features))
 
 
 class LastPlanesNetwork(BoardNetwork):

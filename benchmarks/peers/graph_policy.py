@@ -19,9 +19,9 @@ class GraphPolicy:
 
     def act(self, board: Any, mask: Any) -> int:
         """Return the best legal column of one board, as nested lists or arrays."""
-        given = {
+        tensors = {
             "observation": np.asarray(board, np.int8).reshape(1, 6, 7, 2),
             "action_mask": np.asarray(mask, np.int8).reshape(1, 7),
         }
-        (actions,) = self._session.run(["action"], given)
+        (actions,) = self._session.run(["action"], tensors)
         return int(actions[0])

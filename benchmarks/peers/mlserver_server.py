@@ -17,7 +17,7 @@ class Policy(MLModel):  # type: ignore[misc]
 
     async def predict(self, payload: InferenceRequest) -> InferenceResponse:
         """Return the action."""
-        board, mask = (NumpyCodec.decode_input(each) for each in payload.inputs)
+        board, mask = (NumpyCodec.decode_input(tensor) for tensor in payload.inputs)
         action = self.policy.act(board, mask)
         output = ResponseOutput(name="action", shape=[1], datatype="INT64", data=[action])
         return InferenceResponse(model_name=self.name, outputs=[output])

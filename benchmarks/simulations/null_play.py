@@ -32,16 +32,16 @@ def rotated(order: tuple[int, ...]) -> tuple[int, ...]:
 def promoted(registry: Registry, same: bool, gates: int) -> int:
     """How many of these gates promote an equally strong version. Each has its own seeds and openings."""
     order = tictactoe.CENTRE_FIRST
-    graphs = [tictactoe.graph(wins=True, order=each) for each in (order, order if same else rotated(order))]
-    champion, challenger = (tictactoe.publish(registry, each).ref for each in graphs)
+    graphs = [tictactoe.graph(wins=True, order=squares) for squares in (order, order if same else rotated(order))]
+    champion, challenger = (tictactoe.publish(registry, graph).ref for graph in graphs)
     row = registry.leagues.get(tictactoe.LEAGUE)
     player = MatchWorker(row.config, registry)
-    found = 0
+    promotions = 0
     for seed in range(gates):
         schedule = verdict(row.config, row.interface, challenger, champion, GATE, seed)
         matches, decision = [], None
         while decision is None or decision.outcome is None:
             matches += player.play(schedule, range(len(matches), min(len(matches) + CHUNK, schedule.length)))
             decision = decide_matches(SequentialTest(GATE, challenger), matches)
-        found += decision.outcome == "promote"
-    return found
+        promotions += decision.outcome == "promote"
+    return promotions

@@ -60,7 +60,7 @@ def promoted(gates: int) -> tuple[int, float]:
     refs = [f"{CONFIG.league}@{number}" for number in (2, 1)]
     roster = {ref: {agent: (described.policies[agent], player) for agent in AGENTS} for ref in refs}
     environment = stepping(CONFIG.environment, NUM_ENVS)
-    found, scores = 0, list[float]()
+    promotions, scores = 0, list[float]()
     for seed in range(gates):
         schedule = verdict(CONFIG, described, *refs, GATE, seed)
         matches, decision = [], None
@@ -68,29 +68,29 @@ def promoted(gates: int) -> tuple[int, float]:
             positions = range(len(matches), min(len(matches) + CHUNK, schedule.length))
             matches += play_matches(schedule, positions, environment, described, roster)
             decision = decide_matches(SequentialTest(GATE, refs[0]), matches)
-        found += decision.outcome == "promote"
+        promotions += decision.outcome == "promote"
         scores += [match.score(0) for match in matches]
-    return found, float(np.mean(np.array(scores) != 0.5))
+    return promotions, float(np.mean(np.array(scores) != 0.5))
 
 
 def _deals() -> list[KuhnPoker]:
     """A game with each deal."""
-    found: dict[bytes, KuhnPoker] = {}
+    deals: dict[bytes, KuhnPoker] = {}
     seed = 0
-    while len(found) < DEALS:
+    while len(deals) < DEALS:
         env = KuhnPoker()
         env.reset(seed)
-        found.setdefault(b"".join(env.observe(agent)[OBSERVATION].tobytes() for agent in AGENTS), env)
+        deals.setdefault(b"".join(env.observe(agent)[OBSERVATION].tobytes() for agent in AGENTS), env)
         seed += 1
-    return list(found.values())
+    return list(deals.values())
 
 
 def _first_wins(env: KuhnPoker, player: OnnxPolicy) -> float:
     """Probability that the player who begins wins a game that is in progress."""
     if env.terminations[AGENTS[0]]:
         return float(env.rewards[AGENTS[0]] > 0)
-    seen = env.observe(env.agent_selection)
-    batch = {name: seen[name][np.newaxis] for name in (OBSERVATION, ACTION_MASK)}
+    observation = env.observe(env.agent_selection)
+    batch = {name: observation[name][np.newaxis] for name in (OBSERVATION, ACTION_MASK)}
     logits = player.distribution(batch).dist_inputs
     assert logits is not None
     chance = 0.0

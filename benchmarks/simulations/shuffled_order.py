@@ -31,12 +31,12 @@ def verdicts_of_shuffled_completion(orders: int) -> dict[tuple[str | None, int],
     rng = np.random.default_rng(6)
     cells = rng.choice(5, p=stronger(EQUALS["drawish"], 35), size=SETTINGS.max_blocks)
     matches = [_match(position, POINTS[cell]) for position, cell in enumerate(cells)]
-    found: dict[tuple[str | None, int], int] = {}
+    verdicts: dict[tuple[str | None, int], int] = {}
     for seed in range(orders):
         random = np.random.default_rng(seed)
         decision = _judged(matches, int(random.integers(1, 9)), random)
-        found[decision] = found.get(decision, 0) + 1
-    return found
+        verdicts[decision] = verdicts.get(decision, 0) + 1
+    return verdicts
 
 
 def _match(position: int, points: Sequence[float]) -> Match:

@@ -50,7 +50,7 @@ def boundary(settings: GateConfig, shares: Sequence[Floats]) -> Boundary:
     corner, mass = (0, 0), [np.ones((1, 1)) for _ in shares]
     corners, tables = [], []
     for blocks in range(1, settings.max_blocks + 1):
-        mass = [_step(each, p) for each, p in zip(mass, shares, strict=True)]
+        mass = [_step(states, p) for states, p in zip(mass, shares, strict=True)]
         reachable = np.max(mass, axis=0) > 1e-12
         if not reachable.any():
             break  # all tests have ended
@@ -61,7 +61,7 @@ def boundary(settings: GateConfig, shares: Sequence[Floats]) -> Boundary:
         llr = gsprt_llr(counts, settings.elo0, settings.elo1, settings.model)
         table = np.zeros(reachable.shape, dtype=np.int8)
         table[reachable] = np.where(llr >= upper, PROMOTED, np.where(llr <= lower, REJECTED, OPEN))
-        mass = [np.where(table == OPEN, each, 0.0) for each in mass]
+        mass = [np.where(table == OPEN, states, 0.0) for states in mass]
         corners.append(corner)
         tables.append(table)
     return Boundary(corners, tables)
@@ -113,7 +113,7 @@ def _trimmed(
 ) -> tuple[tuple[int, int], NDArray[np.bool_], list[Floats]]:
     rows, columns = np.flatnonzero(reachable.any(axis=1)), np.flatnonzero(reachable.any(axis=0))
     box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return (corner[0] + int(rows[0]), corner[1] + int(columns[0])), reachable[box], [each[box] for each in mass]
+    return (corner[0] + int(rows[0]), corner[1] + int(columns[0])), reachable[box], [states[box] for states in mass]
 
 
 def _window(mass: Floats, offset: tuple[int, int], shape: tuple[int, ...]) -> Floats:

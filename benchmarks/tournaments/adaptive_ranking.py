@@ -1,24 +1,23 @@
 """Does the adaptive schedule, with a quarter of the games, rank as well as a full round robin?
 
 Simulation: 64 contestants in steps of 25 Elo; each game is drawn from the logistic model. The round robin plays
-`--matches` matches of two games between each pair (32 is the default of `league evaluate`), the adaptive schedule a
+some matches of two games between each pair (32 is the default of `league evaluate`), the adaptive schedule a
 quarter of that in total. Both are rated like the league, and Kendall's τ of the ratings and the true strengths is
 compared for each seed. A second ladder has uneven steps: 25 Elo on average, exponentially distributed.
 
 Target: at least the round robin's τ at the default number of matches; results for fewer matches are printed.
 """
 
-import argparse
 import math
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 from scipy.stats import kendalltau
 
+from benchmarks.harness import Target
 from evaluation.schedules.adaptive_pairing import choose, ring, round_size
 from evaluation.schedules.tournament_plan import ADAPTIVE_SHARE, DEFAULT_BLOCKS
 from evaluation.statistics.bradley_terry import bradley_terry
@@ -27,66 +26,33 @@ from league.results.records import GAMES_PER_BLOCK
 CONTESTANTS = 64
 STEP = 25 * math.log(10) / 400
 """25 Elo in log odds."""
-HEADER = (
-    "ladder",
-    "matches a pair",
-    "games: full, adaptive",
-    "τ full",
-    "τ adaptive",
-    "difference",
-    "round s",
-    "target",
-)
-
 Floats = NDArray[np.float64]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print a line for each ladder and number of matches; 1 if the target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="smoke test: 10 seeds of the default length")
-    parser.add_argument("--seeds", type=int, default=200)
-    parser.add_argument("--matches", type=int, action="append", help="matches of each pair; may be repeated")
-    options = parser.parse_args(argv)
-    if options.quick:
-        return run(quick=True)
-    return compare(options.matches or [4, 10, DEFAULT_BLOCKS], options.seeds)
-
-
-def run(quick: bool = False) -> int:
-    """Run the benchmark with its usual settings."""
-    return compare([DEFAULT_BLOCKS] if quick else [4, 10, DEFAULT_BLOCKS], seeds=10 if quick else 200)
-
-
-def compare(lengths: Sequence[int], seeds: int) -> int:
+def run(quick: bool) -> Iterator[Target]:
     """Simulate tournaments with each number of matches on both ladders."""
-    print(" | ".join(HEADER), flush=True)
-    met = True
-    for name, ladder in LADDERS.items():
-        for matches in lengths:
-            met &= _report(name, ladder, matches, seeds) or matches != DEFAULT_BLOCKS
-    return int(not met)
+    seeds = 10 if quick else 200
+    for ladder in LADDERS:
+        for matches in [DEFAULT_BLOCKS] if quick else [4, 10, DEFAULT_BLOCKS]:
+            yield compare(ladder, matches, seeds)
 
 
-def _report(name: str, ladder: Callable[[np.random.Generator], Floats], matches: int, seeds: int) -> bool:
-    pairs = CONTESTANTS * (CONTESTANTS - 1) // 2
-    adaptive_matches = matches * pairs // ADAPTIVE_SHARE
+def compare(ladder: str, matches: int, seeds: int) -> Target:
+    """Compare both schedules. matches: of each pair in the round robin."""
+    budget = matches * CONTESTANTS * (CONTESTANTS - 1) // 2 // ADAPTIVE_SHARE
     taus, slowest = np.zeros((seeds, 2)), 0.0
     for seed in range(seeds):
-        truth = ladder(np.random.default_rng([seed, 0]))
+        truth = LADDERS[ladder](np.random.default_rng([seed, 0]))
         taus[seed, 0] = _tau(_round_robin(truth, matches, np.random.default_rng([seed, 1])), truth)
-        played, seconds = _adaptive(truth, adaptive_matches, np.random.default_rng([seed, 2]))
+        played, seconds = _adaptive(truth, budget, np.random.default_rng([seed, 2]))
         taus[seed, 1] = _tau(played, truth)
         slowest = max(slowest, seconds)
-    full, adaptive, difference = (_mean(each) for each in (*taus.T, taus[:, 1] - taus[:, 0]))
-    met = bool((taus[:, 1] - taus[:, 0]).mean() >= 0)
-    target = ("met" if met else "MISSED (≥ 0)") if matches == DEFAULT_BLOCKS else "–"
-    games = f"{pairs * matches * GAMES_PER_BLOCK:,}, {adaptive_matches * GAMES_PER_BLOCK:,}"
-    print(
-        f"{name} | {matches} | {games} | {full} | {adaptive} | {difference} | {slowest:.3f} | {target}",
-        flush=True,
-    )
-    return met
+    gains = taus[:, 1] - taus[:, 0]
+    error = 1.96 * gains.std(ddof=1) / math.sqrt(seeds)
+    note = f"± {error:.4f}; slowest round {slowest:.3f} s"
+    name = f"adaptive, {ladder} ladder, {matches} matches a pair: change of τ"
+    least = 0.0 if matches == DEFAULT_BLOCKS else None
+    return Target(name, round(float(gains.mean()), 4), at_least=least, peer="round robin", note=note)
 
 
 def _even(rng: np.random.Generator) -> Floats:  # noqa: ARG001
@@ -137,12 +103,3 @@ def _tau(table: Table, truth: Floats) -> float:
     pairs = np.column_stack([first, second])
     rated = bradley_terry(points[first, second][None] + 0.5, games[first, second][None] + 1, pairs, CONTESTANTS, 0)[0]
     return float(kendalltau(rated, truth).statistic)
-
-
-def _mean(values: Floats) -> str:
-    half = 1.96 * values.std(ddof=1) / math.sqrt(len(values))
-    return f"{values.mean():+.4f} ± {half:.4f}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

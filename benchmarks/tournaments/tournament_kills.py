@@ -11,7 +11,6 @@ killed, compared with one per worker; and repeated starts of chunks, compared wi
 and node. A chunk is delayed for a moment, as tic-tac-toe is quick: otherwise few kills would interrupt one.
 """
 
-import argparse
 import os
 import random
 import signal
@@ -20,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +28,7 @@ from typing import Any
 import ray
 from ray.cluster_utils import Cluster
 
+from benchmarks.harness import Target
 from evaluation.matches import tournament
 from evaluation.matches.worker import match_worker
 from evaluation.schedules.builders import round_robin
@@ -49,40 +49,19 @@ DEADLINE = 90.0
 KINDS = ("driver", "worker", "node")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Print the kills and the result; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="smoke test: 10 kills")
-    parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the kills")
-    parser.add_argument("--drive", nargs=2, metavar=("SCRATCH", "ADDRESS"), help=argparse.SUPPRESS)
-    options = parser.parse_args(argv)
-    if options.drive:
-        _drive(Path(options.drive[0]), options.drive[1])
-        return 0
-    return run_with_kills(10 if options.quick else options.kills, options.seed)
-
-
-def run(quick: bool = False) -> int:
-    """Run the benchmark with its usual settings."""
-    return run_with_kills(10 if quick else 100, seed=0)
-
-
-def run_with_kills(kills: int, seed: int) -> int:
-    """Kill `kills` times; 1 if anything was lost, duplicated or different, or too much was repeated."""
-    began = time.perf_counter()
+def run(quick: bool) -> Iterator[Target]:
+    """Kill at random, and compare what was played with an undisturbed tournament."""
     with tempfile.TemporaryDirectory() as scratch:
         registry, schedule = _open(Path(scratch))
-        experiment = _Experiment(
-            Path(scratch), random.Random(seed), lambda: len(Ledger(registry).positions(schedule.id))
-        )
+        experiment = _Experiment(Path(scratch), random.Random(0), lambda: len(Ledger(registry).positions(schedule.id)))
         try:
-            for _ in range(kills):
+            for _ in range(10 if quick else 100):
                 experiment.kill_one()
             experiment.end()
         finally:
             experiment.close()
-        return _report(registry, schedule, experiment, time.perf_counter() - began)
+        yield from _results(registry, schedule, experiment)
+        registry.close()
 
 
 def _open(scratch: Path) -> tuple[Registry, Schedule]:
@@ -95,7 +74,7 @@ def _open(scratch: Path) -> tuple[Registry, Schedule]:
     )
     registry = Registry.open(Storage.at(scratch / "home"))
     registry.leagues.register(config, interface(config))
-    contestants = [*baselines(interface(config)), "script:first"]
+    contestants = [*baselines(config, interface(config)), "script:first"]
     schedule = round_robin(config, interface(config), contestants, blocks=20_000)
     return registry, Ledger(registry).open(schedule)
 
@@ -122,8 +101,8 @@ class _Experiment:
 
     def kill_one(self) -> None:
         """Wait until a chunk has started, a little longer, and kill something."""
-        known = len(starts(self.scratch))
-        self._until(lambda: len(starts(self.scratch)) > known)
+        begun_before = len(starts(self.scratch))
+        self._until(lambda: len(starts(self.scratch)) > begun_before)
         time.sleep(self.chance.uniform(0, 2 * HOLD))
         kind = self.chance.choice(KINDS)
         getattr(self, f"_kill_{kind}")()
@@ -131,8 +110,8 @@ class _Experiment:
 
     def end(self) -> None:
         """Wait undisturbed for some chunks, and stop the driver."""
-        known = len(starts(self.scratch))
-        self._until(lambda: len(starts(self.scratch)) > known + 4 * NODES)
+        begun_before = len(starts(self.scratch))
+        self._until(lambda: len(starts(self.scratch)) > begun_before + 4 * NODES)
         _stop(self.scratch).touch()
         if code := self.driver.wait(timeout=DEADLINE):
             raise RuntimeError(f"the driver has failed with exit code {code}:\n{self._log.read_text()[-2000:]}")
@@ -168,7 +147,7 @@ class _Experiment:
         self.nodes.append(self.cluster.add_node(num_cpus=1))
 
     def _start(self) -> subprocess.Popen:
-        command = [sys.executable, "-m", "benchmarks.tournaments.tournament_kills", "--drive", str(self.scratch)]
+        command = [sys.executable, "-m", "benchmarks.tournaments.tournament_kills", str(self.scratch)]
         with self._log.open("a") as log:
             return subprocess.Popen([*command, self.cluster.address], stdout=log, stderr=log)
 
@@ -221,29 +200,26 @@ def _stop(scratch: Path) -> Path:
     return scratch / "stop"
 
 
-def _report(registry: Registry, schedule: Schedule, experiment: _Experiment, seconds: float) -> int:
-    found = Ledger(registry).matches(league=LEAGUE, schedule=schedule.id)
+def _results(registry: Registry, schedule: Schedule, experiment: _Experiment) -> Iterator[Target]:
+    matches = Ledger(registry).matches(league=LEAGUE, schedule=schedule.id)
     document = registry.leagues.get(LEAGUE).config.model_dump_json(by_alias=True)
-    expected = match_worker(registry.storage, document).play(schedule, range(len(found)))
-    positions = Counter(match.position for match in found)
-    lost = len(set(range(len(found))) - set(positions))
-    doubled = sum(count - 1 for count in positions.values())
-    different = sum(one != other for one, other in zip(found, expected, strict=True))
+    expected = match_worker(registry.storage, document).play(schedule, range(len(matches)))
+    positions = Counter(match.position for match in matches)
+    counts = {
+        "lost": len(set(range(len(matches))) - set(positions)),
+        "duplicated": sum(count - 1 for count in positions.values()),
+        "different": sum(match != undisturbed for match, undisturbed in zip(matches, expected, strict=True)),
+    }
+    kills = ", ".join(f"{experiment.killed[kind]} of a {kind}" for kind in KINDS)
+    name = f"kills: matches {', '.join(counts)}"
+    yield Target(name, tuple(counts.values()), at_most=0, note=f"of {len(matches):,}; {kills}")
+    most = max(experiment.open_at_driver_kill, default=0)
+    yield Target("kills: open chunks at a driver's death", most, at_most=NODES)
     chunk_starts = starts(experiment.scratch)
     again = len(chunk_starts) - len({position for position, _ in chunk_starts})
-    most = max(experiment.open_at_driver_kill, default=0)
     allowed = sum(experiment.open_at_driver_kill) + experiment.killed["worker"] + experiment.killed["node"]
-    named = ", ".join(f"{experiment.killed[kind]} of a {kind}" for kind in KINDS)
-    print(f"{experiment.killed.total()} kills: {named}; {len(found):,} matches in {seconds:.0f} s")
-    print("lost | doubled | different | open chunks at a driver's death, at most | chunks started again | target")
-    met = bool(found) and not (lost or doubled or different) and most <= NODES and again <= allowed
-    print(
-        f"{lost} | {doubled} | {different} | {most} of {NODES} | {again} of at most {allowed}"
-        f" | {'met' if met else 'MISSED (0, 0, 0, one per worker)'}"
-    )
-    registry.close()
-    return int(not met)
+    yield Target("kills: chunks started again", again, at_most=allowed)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    _drive(Path(sys.argv[1]), sys.argv[2])

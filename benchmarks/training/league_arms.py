@@ -9,14 +9,15 @@ import math
 import shutil
 import statistics
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks.training.learned import one_thread, report_target, two_at_once
+from benchmarks.harness import CONFIGS, Target
+from benchmarks.training.learned import one_thread, two_at_once
 from evaluation.gating.exploitability import exploitability
 from evaluation.matches.worker import MatchWorker
 from evaluation.results import ExploiterScore
@@ -31,7 +32,7 @@ from league.registry.storage.manifest import Manifest
 from league.settings import Storage
 from training.runs.train import train
 
-CONFIG = Path(__file__).parent.parent.parent / "policy_league/configs" / "connect_four.yaml"
+CONFIG = CONFIGS / "connect_four.yaml"
 SEEDS = range(3)
 MINUTES = 28.0
 """Of training, by default."""
@@ -67,8 +68,8 @@ class Arm:
     exploiter: ExploiterScore
 
 
-def compare_arms(minutes: float, seeds: Sequence[int] = SEEDS) -> bool:
-    """Print the results of all seeds, and whether the league's means meet the targets. minutes: of each training."""
+def compare_arms(minutes: float, seeds: Sequence[int] = SEEDS) -> Iterator[Target]:
+    """Train and measure both arms with all seeds. minutes: of each training."""
     arms: dict[str, list[Arm]] = {SELF_PLAY: [], LEAGUE: []}
     scores: list[float] = []
     for seed in seeds:
@@ -77,15 +78,21 @@ def compare_arms(minutes: float, seeds: Sequence[int] = SEEDS) -> bool:
             for job, arm in zip(jobs, two_at_once(work, jobs), strict=True):
                 arms[job.name].append(arm)
                 best = arm.exploiter
-                print(
-                    f"connect four, {job.name}, seed {seed}: {arm.steps:,} actions; lowest score against its past"
-                    f" {arm.lowest:.3f}; exploiter {best.score:.3f} [{best.low:.3f}, {best.high:.3f}]",
-                    flush=True,
-                )
-            score = _between(jobs, [arms[job.name][-1].last for job in jobs])
-            print(f"connect four, seed {seed}: {statistics.mean(score):.3f} against self-play", flush=True)
-            scores += score
-    return _targets(arms, scores)
+                note = f"{arm.steps:,} actions; exploiter {best.score:.3f} [{best.low:.3f}, {best.high:.3f}]"
+                name = f"connect_four, lowest score against its past, {job.name}, seed {seed}"
+                yield Target(name, round(arm.lowest, 3), note=note)
+            scores += _between(jobs, [arms[job.name][-1].last for job in jobs])
+    past, exploited = (
+        {name: statistics.mean(map(value, results)) for name, results in arms.items()}
+        for value in (lambda arm: arm.lowest, lambda arm: arm.exploiter.score)
+    )
+    score, low, high = map(elo, score_interval(scores))
+    gain = round(past[LEAGUE] - past[SELF_PLAY], 3)
+    yield Target("connect_four, gain of the lowest score against its past", gain, at_least=GAIN)
+    name, limit = "connect_four, score of the exploiters", round(exploited[SELF_PLAY], 3)
+    yield Target(name, round(exploited[LEAGUE], 3), at_most=limit, peer=SELF_PLAY)
+    note = f"{score:+.0f} Elo, at most {high:+.0f}"
+    yield Target("connect_four, strength, lower bound", round(low), "Elo", INFERIOR, peer=SELF_PLAY, note=note)
 
 
 def work(job: ArmJob) -> Arm:
@@ -110,37 +117,16 @@ def _between(jobs: Sequence[ArmJob], refs: Sequence[str]) -> list[float]:
         return _scores(registry, config, refs[0], [opponent.ref])[0]
 
 
-def _targets(arms: dict[str, list[Arm]], scores: list[float]) -> bool:
-    past = {name: statistics.mean(arm.lowest for arm in found) for name, found in arms.items()}
-    exploited = {name: statistics.mean(arm.exploiter.score for arm in found) for name, found in arms.items()}
-    score, low, high = score_interval(scores)
-    gain = past[LEAGUE] - past[SELF_PLAY]
-    goals = [
-        report_target(f"connect four, lowest score against its past: {gain:+.3f}", f"+{GAIN:g}", gain >= GAIN),
-        report_target(
-            f"connect four, score of the exploiter: {exploited[LEAGUE]:.3f}",
-            f"below {exploited[SELF_PLAY]:.3f}",
-            exploited[LEAGUE] < exploited[SELF_PLAY],
-        ),
-        report_target(
-            f"connect four, strength against self-play: {elo(score):+.0f} Elo [{elo(low):+.0f}, {elo(high):+.0f}]",
-            f"not below {INFERIOR:g}",
-            elo(low) >= INFERIOR,
-        ),
-    ]
-    return all(goals)
-
-
 def train_arm(registry: Registry, config: LeagueConfig) -> Arm:
     """Train, play the last version against the earlier ones, and train and play its exploiter."""
     quiet = Console(file=io.StringIO())
     versions = train(config, registry=registry, console=quiet, local=ONE_CORE)
     last, target = versions[-1], CheckpointRef(config.league, versions[-1].number)
-    lowest = min(map(statistics.mean, _scores(registry, config, last.ref, [each.ref for each in versions[:-1]])))
+    lowest = min(map(statistics.mean, _scores(registry, config, last.ref, [version.ref for version in versions[:-1]])))
     settings = config.of_exploiter(config.training.seed, None, config.training.minutes, EXPLOITER)
     train(settings, registry=registry, parent=target, role="exploiter", target=target, console=quiet, local=ONE_CORE)
-    found = exploitability(target, registry=registry, blocks=BLOCKS)
-    return Arm(last.ref, last.steps, lowest, found.exploiters[0])
+    score = exploitability(target, registry=registry, blocks=BLOCKS)
+    return Arm(last.ref, last.steps, lowest, score.exploiters[0])
 
 
 def elo(score: float) -> float:
@@ -163,8 +149,8 @@ def _config(arm: str, seed: int, minutes: float) -> LeagueConfig:
 def _scores(registry: Registry, config: LeagueConfig, version: str, opponents: list[str]) -> list[list[float]]:
     """Play a version against others, without recording the matches; return its scores against each one."""
     schedule = gauntlet(config, interface(config), [version], opponents, BLOCKS)
-    found: dict[str, list[float]] = {ref: [] for ref in opponents}
+    scores: dict[str, list[float]] = {ref: [] for ref in opponents}
     for match in MatchWorker(config, registry).play(schedule, range(schedule.length)):
         number = match.contestants.index(version)
-        found[match.contestants[1 - number]].append(match.score(number))
-    return list(found.values())
+        scores[match.contestants[1 - number]].append(match.score(number))
+    return list(scores.values())

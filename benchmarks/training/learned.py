@@ -28,7 +28,8 @@ from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from training.runs.trial import build_algorithm
 
-Work, Result = TypeVar("Work"), TypeVar("Result")
+Work = TypeVar("Work")
+Result = TypeVar("Result")
 Z = 1.96
 
 
@@ -99,15 +100,24 @@ def learn(
 
 def updates(algorithm: Algorithm, seconds: float, steps: float) -> Iterator[CurvePoint]:
     """Train for `seconds` of training time, or for `steps` actions. Yields after each update."""
-    taken, spent = 0, 0.0
-    while spent < seconds and taken < steps:
-        algorithm.progress = ScheduleProgress(taken, max(spent / seconds, taken / steps))
+    steps_done, spent = 0, 0.0
+    while spent < seconds and steps_done < steps:
+        algorithm.progress = ScheduleProgress(steps_done, max(spent / seconds, steps_done / steps))
         began = time.perf_counter()
         play = algorithm.train()[ENV_RUNNER_RESULTS]
         spent += time.perf_counter() - began
-        taken += int(play[NUM_ENV_STEPS_SAMPLED])
+        steps_done += int(play[NUM_ENV_STEPS_SAMPLED])
         returns = {policy: float(value) for policy, value in play.get(EPISODE_MODULE_RETURN_MEAN, {}).items()}
-        yield CurvePoint(taken, spent, int(play.get(NUM_EPISODES, 0)), returns)
+        yield CurvePoint(steps_done, spent, int(play.get(NUM_EPISODES, 0)), returns)
+
+
+def print_progress(name: str, curve: Sequence[CurvePoint]) -> None:
+    """Print the budget of a training, and about ten points of its curve."""
+    print(f"{name}: {curve[-1].steps:,} actions in {curve[-1].seconds:,.0f} s", flush=True)
+    ended = [point for point in curve if point.episodes]
+    for point in ended[:: max(1, len(ended) // 10)]:
+        returns = ", ".join(f"{policy} {value:.2f}" for policy, value in point.returns.items())
+        print(f"    {point.steps:>9,} actions, while exploring: {returns}", flush=True)
 
 
 def greedy_returns(algorithm: Algorithm, episodes: int) -> NDArray:
@@ -123,7 +133,9 @@ def _returns(algorithm: Algorithm, episodes: int, random_actions: bool) -> NDArr
         ),
         local_env_runner=algorithm.env_runner_group.num_remote_env_runners() == 0,
     )
-    return np.array([chunk.get_return() for own in chunks for chunk in own if chunk.is_done and chunk.t_started == 0])
+    return np.array(
+        [chunk.get_return() for runner in chunks for chunk in runner if chunk.is_done and chunk.t_started == 0]
+    )
 
 
 def _parameters(algorithm: Algorithm) -> int:
@@ -148,9 +160,3 @@ def interval(values: NDArray) -> tuple[float, float]:
     """The two-sided 95 % confidence interval of the mean of independent values, by the normal approximation."""
     mean, error = float(values.mean()), float(values.std(ddof=1) / len(values) ** 0.5)
     return mean - Z * error, mean + Z * error
-
-
-def report_target(what: str, target: str, met: bool) -> bool:
-    """Print and return whether a target is met."""
-    print(f"{what}: target {target}: {'met' if met else 'MISSED'}", flush=True)
-    return met

@@ -89,8 +89,8 @@ class Hand:
     def information_state(self, rank: int) -> NDArray:
         """The observation of `examples.leduc_holdem`: that of the player to act, and the actions of both rounds."""
         actions = np.zeros((ROUNDS, MOST_ACTIONS, 4), np.float32)
-        for round_, taken in enumerate(self.history):
-            actions[round_, range(len(taken)), list(taken)] = 1
+        for round_, taken_actions in enumerate(self.history):
+            actions[round_, range(len(taken_actions)), list(taken_actions)] = 1
         return np.concatenate([self.observation(rank), actions.ravel()])
 
     def payoff(self, player: int, ranks: tuple[int, int]) -> float:
@@ -109,8 +109,8 @@ def best_response(policy_function: PolicyFunction, observe: Callable[[Hand, int]
 
     observe: what the policy observes of a hand with its card.
     """
-    known = cache(lambda hand, rank: policy_function(observe(hand, rank), hand.legal()))
-    return float(np.mean([_dealt(known, player) for player in (0, 1)]))
+    play = cache(lambda hand, rank: policy_function(observe(hand, rank), hand.legal()))
+    return float(np.mean([_dealt(play, player) for player in (0, 1)]))
 
 
 def uniform(_: NDArray, mask: NDArray) -> NDArray:
@@ -128,34 +128,34 @@ def greedy(policy: Policy) -> PolicyFunction:
     return policy_function
 
 
-def _dealt(known: Callable[[Hand, int], NDArray], player: int) -> float:
+def _dealt(play: Callable[[Hand, int], NDArray], player: int) -> float:
     """The value of the best response as `player`, averaged over its cards and those of the opponent."""
     value = 0.0
-    for own in range(RANKS):
-        chances = np.array([COPIES - (other == own) for other in range(RANKS)]) / (RANKS * COPIES - 1)
-        value += _value(known, Hand(), player, own, chances) / RANKS
+    for rank in range(RANKS):
+        chances = np.array([COPIES - (other == rank) for other in range(RANKS)]) / (RANKS * COPIES - 1)
+        value += _value(play, Hand(), player, rank, chances) / RANKS
     return value
 
 
-def _value(known: Callable[[Hand, int], NDArray], hand: Hand, player: int, own: int, reach: NDArray) -> float:
-    """The value of a hand for the best response with the card `own`. reach (3,): the joint probability of each card of
+def _value(play: Callable[[Hand, int], NDArray], hand: Hand, player: int, rank: int, reach: NDArray) -> float:
+    """The value of a hand for the best response with the card `rank`. reach (3,): the joint probability of each card of
     the opponent and of its previous actions with it.
     """
     if hand.is_over:
-        ranks = [(own, other) if player == 0 else (other, own) for other in range(RANKS)]
+        ranks = [(rank, other) if player == 0 else (other, rank) for other in range(RANKS)]
         return sum(p * hand.payoff(player, pair) for p, pair in zip(reach, ranks, strict=True) if p)
     if hand.awaits_card:
         left = RANKS * COPIES - 2
         value = 0.0
         for public in range(RANKS):
-            chances = np.array([COPIES - (public == own) - (public == other) for other in range(RANKS)]) / left
-            value += _value(known, replace(hand, public=public), player, own, reach * chances.clip(min=0))
+            chances = np.array([COPIES - (public == rank) - (public == other) for other in range(RANKS)]) / left
+            value += _value(play, replace(hand, public=public), player, rank, reach * chances.clip(min=0))
         return value
     actions = np.flatnonzero(hand.legal()).tolist()
     if hand.turn == player:
-        return max(_value(known, hand.after(action), player, own, reach) for action in actions)
-    plays = np.stack([known(hand, other) for other in range(RANKS)])
-    return sum(_value(known, hand.after(action), player, own, reach * plays[:, action]) for action in actions)
+        return max(_value(play, hand.after(action), player, rank, reach) for action in actions)
+    plays = np.stack([play(hand, other) for other in range(RANKS)])
+    return sum(_value(play, hand.after(action), player, rank, reach * plays[:, action]) for action in actions)
 
 
 def _plus(pair: tuple[int, int], place: int, amount: int) -> tuple[int, int]:

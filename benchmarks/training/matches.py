@@ -34,8 +34,8 @@ def games(trained: Policy, league: LeagueConfig, opponent: str, count: int, seed
     """Play games against a script; the trained policy is contestant 0. Raises IllegalAction on an illegal action."""
     league_interface = interface_of(league)
     schedule = round_robin(league, league_interface, [TRAINED, opponent], count // 2, seed)
-    own = {agent: (policy, trained) for agent, policy in league_interface.policies.items()}
-    roster = {TRAINED: own, opponent: contestant(opponent, None, league_interface)}
+    policies = {agent: (policy, trained) for agent, policy in league_interface.policies.items()}
+    roster = {TRAINED: policies, opponent: contestant(opponent, None, league_interface)}
     environment = stepping(league.environment, NUM_ENVS)
     try:
         matches = play_matches(schedule, range(schedule.length), environment, league_interface, roster)

@@ -1,21 +1,22 @@
 """The two-step game by QMIX, VDN and independent Q-learning: returns and learned joint values."""
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 
-from benchmarks.training.learned import greedy_returns, local_ray, one_thread, report_target, two_at_once
+from benchmarks.harness import CONFIGS, Target
+from benchmarks.training.learned import greedy_returns, local_ray, one_thread, two_at_once
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from policy_league.examples.two_step import ACTIONS, AGENTS, STATES, values
 from training.runs.trial import build_algorithm
 
-CONFIG = Path(__file__).parents[2] / "policy_league/configs" / "two_step_game.yaml"
+CONFIG = CONFIGS / "two_step_game.yaml"
 SEEDS, MAX_SECONDS, NEAR = 20, 60.0, 0.1
 RETURNS = {"qmix": 8.0, "vdn": 7.0, "none": 7.0}
 """Of greedy play: QMIX finds the optimum, the others cannot."""
@@ -58,8 +59,8 @@ def joint_values(algorithm: Algorithm) -> NDArray:
     """(3, 2, 2) the learned value of each pair of actions in each state."""
     learner = algorithm.learner_group._learner
     states, agents = torch.eye(STATES), torch.eye(len(AGENTS))
-    seen = [torch.cat([states, agents[i].expand(STATES, -1)], dim=1) for i in range(len(AGENTS))]
-    first, second = (learner.module["shared"].values({"observation": rows}) for rows in seen)
+    observations = [torch.cat([states, agents[i].expand(STATES, -1)], dim=1) for i in range(len(AGENTS))]
+    first, second = (learner.module["shared"].values({"observation": rows}) for rows in observations)
     mixer = learner.mixer(learner.networks, "team")
     pairs = [(a, b) for a in range(ACTIONS) for b in range(ACTIONS)]
     mixed = [mixer(torch.stack([first[:, a], second[:, b]], dim=1), states).mean(-1) for a, b in pairs]
@@ -73,29 +74,17 @@ def work(job: tuple[str, int]) -> LearningResult:
         return learn(*job)
 
 
-def two_step_game(scale: float) -> bool:
+def two_step_game(scale: float) -> Iterator[Target]:
     """Twenty seeds of each mixer."""
     seeds = range(max(1, round(SEEDS * scale)))
     gamma = LeagueConfig.load(CONFIG).training.gamma
     jobs = [(mixer, seed) for mixer in RETURNS for seed in seeds]
-    found = dict(zip(jobs, two_at_once(work, jobs), strict=True))
-    for (mixer, seed), each in found.items():
-        print(
-            f"{mixer:>5} seed {seed:>2}: return {each.returned:g}, largest error {each.error(gamma):.2g},"
-            f" {each.seconds:.1f} s; Q_tot {' | '.join(' '.join(f'{v:.2f}' for v in g.ravel()) for g in each.joint)}"
-        )
-    reached = {mixer: sum(found[mixer, seed].returned == best for seed in seeds) for mixer, best in RETURNS.items()}
+    results = dict(zip(jobs, two_at_once(work, jobs), strict=True))
     for mixer, best in RETURNS.items():
-        print(f"{mixer:>5}: return {best:g} in {reached[mixer]} of {len(seeds)} seeds")
-    worst = max(found["qmix", seed].error(gamma) for seed in seeds)
-    slowest = max(each.seconds for each in found.values())
-    print(f"largest error of the {STATES * ACTIONS**2} values by QMIX: {worst:.2g}; slowest seed: {slowest:.1f} s")
-    return all(
-        [
-            report_target(
-                "QMIX returns 8, VDN and none 7", "all seeds", all(count == len(seeds) for count in reached.values())
-            ),
-            report_target("largest error of a value by QMIX", f"below {NEAR:g}", worst < NEAR),
-            report_target("a seed on one core", f"at most {MAX_SECONDS:g} s", slowest <= MAX_SECONDS),
-        ]
-    )
+        reached = sum(results[mixer, seed].returned == best for seed in seeds)
+        name = f"two_step_game, {mixer}, seeds with return {best:g}"
+        yield Target(name, reached, f"of {len(seeds)}", at_least=len(seeds))
+    worst = max(results["qmix", seed].error(gamma) for seed in seeds)
+    yield Target("two_step_game, largest error of a value by QMIX", worst, at_most=NEAR)
+    slowest = max(result.seconds for result in results.values())
+    yield Target("two_step_game, slowest seed", round(slowest, 1), "s", at_most=MAX_SECONDS)

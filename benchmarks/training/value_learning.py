@@ -1,25 +1,22 @@
 """The parts of `benchmarks.learning` with DQN: Leduc hold'em, and connect four. All seeds are printed."""
 
 import itertools
-import multiprocessing
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from ray.rllib.algorithms.algorithm import Algorithm
 from scipy.stats import binomtest
 
-from benchmarks.training.learned import interval, local_ray, one_thread, report_target
+from benchmarks.harness import CONFIGS, Target
+from benchmarks.training.learned import interval, local_ray, one_thread, two_at_once
 from benchmarks.training.leduc import best_response, greedy, uniform
 from benchmarks.training.matches import games, graph
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.runs.trial import build_algorithm
 
-CONFIGS = Path(__file__).parents[2] / "policy_league/configs"
 SEEDS = range(3)
 RLCARD, BEST = 1.21, 1.4716
 """Return per hand of Leduc against a random opponent: RLCard's DQN, and the exact best response."""
@@ -37,65 +34,53 @@ class Outcome:
     """Actions, and a measurement at that time."""
 
 
-def leduc_vs_random(scale: float) -> bool:
+def leduc_vs_random(scale: float) -> Iterator[Target]:
     """Winnings against a random opponent, over hands on both sides."""
-    met = True
-    for seed, found in zip(SEEDS, _work(_against_random, scale), strict=True):
-        low, mean = found.measured["low"], found.measured["mean"]
-        met &= low >= RLCARD
-        print(
-            f"seed {seed}: {found.steps:,} actions in {found.seconds:.0f} s; {mean:+.3f} per hand over"
-            f" {found.measured['hands']:,.0f} hands, lower 95 % bound {low:+.3f} (best response {BEST:+.4f})"
-        )
-    return report_target("lower bound of each seed", f"{RLCARD:+.2f}", met)
+    outcomes = _work(_against_random, scale)
+    lows = tuple(round(outcome.measured["low"], 3) for outcome in outcomes)
+    means = ", ".join(f"{outcome.measured['mean']:+.3f}" for outcome in outcomes)
+    note = f"means {means}; best response {BEST:+.4f}"
+    yield Target("leduc_vs_random, gain per hand, lower bound", lows, at_least=RLCARD, peer="RLCard's DQN", note=note)
 
 
-def leduc_holdem_dqn(scale: float) -> bool:
+def leduc_holdem_dqn(scale: float) -> Iterator[Target]:
     """Exploitability in self-play: the winnings of an exact best response, over training."""
-    met, random = True, best_response(uniform)
-    print(f"uniform play: {random:.4f}")
-    for seed, found in zip(SEEDS, _work(_exploitability, scale), strict=True):
-        first, last = found.curve[0][1], found.curve[-1][1]
-        met &= last < min(first, random)
-        shown = ", ".join(f"{steps // 1000}k {value:.2f}" for steps, value in found.curve)
-        print(f"seed {seed}: {found.steps:,} actions in {found.seconds:.0f} s; exploitability at {shown}")
-    return report_target("exploitability at the end", "below uniform play's and the first checkpoint's", met)
+    random = best_response(uniform)
+    for seed, outcome in zip(SEEDS, _work(_exploitability, scale), strict=True):
+        values = tuple(round(value, 3) for _, value in outcome.curve)
+        yield Target(f"leduc_holdem_dqn, exploitability, seed {seed}", values)
+        name = f"leduc_holdem_dqn, final exploitability, seed {seed}"
+        yield Target(name, values[-1], at_most=min(values[0], random))
 
 
-def connect_four_dqn(scale: float) -> bool:
+def connect_four_dqn(scale: float) -> Iterator[Target]:
     """The fraction of wins against random play with openings, and whether any of a million moves was illegal."""
-    met = True
-    for seed, found in zip(SEEDS, _work(_connect_four, scale), strict=True):
-        met &= found.measured["low"] >= 0.95
-        print(
-            f"seed {seed}: {found.steps:,} actions in {found.seconds:.0f} s; won {found.measured['won']:.2%} of"
-            f" {found.measured['games']:,.0f} games, lower 95 % bound {found.measured['low']:.2%};"
-            f" {found.measured['moves']:,.0f} moves, none illegal"
-        )
-    return report_target("lower bound of each seed", "95 %", met)
+    outcomes = _work(_connect_four, scale)
+    lows = tuple(round(100 * outcome.measured["low"], 2) for outcome in outcomes)
+    # An illegal move would have ended the games with an error.
+    note = f"{sum(outcome.measured['moves'] for outcome in outcomes):,.0f} legal moves"
+    yield Target("connect_four_dqn against random play, lower bound", lows, "%", at_least=95.0, note=note)
 
 
-def _work(one: Callable[[int, float], Outcome], scale: float) -> list[Outcome]:
-    """Run each seed, two at a time, on one core each."""
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
-        return list(pool.map(one, SEEDS, [scale] * len(SEEDS)))
+def _work(train: Callable[[tuple[int, float]], Outcome], scale: float) -> list[Outcome]:
+    """Run each seed on one core."""
+    return list(two_at_once(train, [(seed, scale) for seed in SEEDS]))
 
 
-def _against_random(seed: int, scale: float) -> Outcome:
+def _against_random(job: tuple[int, float]) -> Outcome:
     def measure(algorithm: Algorithm, league: LeagueConfig) -> dict[str, float]:
-        played = games(graph(algorithm, league), league, "script:random", int(HANDS * min(1.0, 10 * scale)))
+        played = games(graph(algorithm, league), league, "script:random", int(HANDS * min(1.0, 10 * job[1])))
         returns = np.array([game.returns[0] for game in played])
         return {"mean": float(returns.mean()), "low": interval(returns)[0], "hands": len(returns)}
 
-    return _train("leduc_vs_random", seed, scale, measure)
+    return _train("leduc_vs_random", *job, measure)
 
 
-def _exploitability(seed: int, scale: float) -> Outcome:
-    return _train("leduc_holdem_dqn", seed, scale, lambda *_: {}, exploitability)
+def _exploitability(job: tuple[int, float]) -> Outcome:
+    return _train("leduc_holdem_dqn", *job, lambda *_: {}, exploitability)
 
 
-def _connect_four(seed: int, scale: float) -> Outcome:
+def _connect_four(job: tuple[int, float]) -> Outcome:
     def measure(algorithm: Algorithm, league: LeagueConfig) -> dict[str, float]:
         trained, moves = graph(algorithm, league), 0
         first = games(trained, league, "script:random", GAMES)
@@ -103,13 +88,13 @@ def _connect_four(seed: int, scale: float) -> Outcome:
         for round_ in itertools.count(1):
             opponent = ("script:random", "script:one_ply")[round_ % 2]
             moves += sum(len(game.actions) // 2 for game in games(trained, league, opponent, 10 * GAMES, round_))
-            if moves >= MOVES * min(1.0, 10 * scale):
+            if moves >= MOVES * min(1.0, 10 * job[1]):
                 break
         won = [game.scores[0] for game in first].count(1.0)
         low = binomtest(won, len(first)).proportion_ci(0.95, "wilson").low
         return {"won": won / len(first), "low": low, "games": len(first), "moves": moves}
 
-    return _train("connect_four_dqn", seed, scale, measure)
+    return _train("connect_four_dqn", *job, measure)
 
 
 def exploitability(algorithm: Algorithm, league: LeagueConfig) -> float:

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from benchmarks.crowded_league import LEAGUE, crowd
 from evaluation.gating.verification import verify
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
+from tests.support.leagues.crowded_league import LEAGUE, crowd
 
 pytestmark = pytest.mark.slow  # it plays 1,500 matches
 

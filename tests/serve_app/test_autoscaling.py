@@ -24,10 +24,10 @@ pytestmark = pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_second_replica_appears_under_load_and_goes_without_a_lost_call() -> None:
     # Other tests use the cores as well: a replica may not get 0.6 of one, and the cost of a request varies.
-    found = autoscaling.follow(steady=3.0, target=0.3, first=1 / 4, factor=6)
-    assert found.seen.lost == []
-    assert len(found.seen.replicas) == 2
-    assert set(found.seen.statuses) <= {"429"}, "an overloaded replica sheds load; no connection is dropped"
+    following = autoscaling.follow(steady=3.0, target=0.3, first=1 / 4, factor=6)
+    assert following.record.lost == []
+    assert len(following.record.replicas) == 2
+    assert set(following.record.statuses) <= {"429"}, "an overloaded replica sheds load; no connection is dropped"
 
 
 @pytest.mark.timeout(300)

@@ -13,11 +13,11 @@ import httpx
 import pytest
 
 from benchmarks.load.http import post
-from benchmarks.load.slow_clients import slow_clients
 from league.client import Client
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.runtime.launch import running
+from tests.support.attacks.slow_clients import slow_clients
 from tests.support.clients.actions import BOARD
 from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.under_load import ACTION, Load, deploy_file, load, processes, serving

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import httpx
 
-from benchmarks.attacks.postgresql_leagues import StandaloneReplica, league_in_postgresql, promote, standalone_replica
-from benchmarks.leagues.served_league import BODY, LEAGUE
+from benchmarks.harness import Target
+from benchmarks.leagues.served_league import ACTION, BODY, promote
 from league.errors import NotReady
 from league.registry.registry import Registry
 from league.registry.replicas import LIVENESS_TIMEOUT
+from tests.support.servers.postgresql_replicas import StandaloneReplica, league_in_postgresql, standalone_replica
 
 WAIT = 0.5
 """Seconds that a promotion of a silent replica is awaited."""
@@ -42,18 +43,15 @@ while True:
 """
 
 
-def confirmations(count: int) -> bool:
-    """Print the number of false confirmations; whether there was none, and each silent replica was named."""
+def confirmations(count: int) -> Iterator[Target]:
+    """The number of false confirmations, and of silent replicas that were not named."""
     with league_in_postgresql() as (registry, postgresql):
-        met = [
-            _silent(registry, postgresql, "stuck", count),
-            _silent(registry, postgresql, "cut off", count),
-            _wrong_clocks(registry, count),
-        ]
-    return all(met)
+        yield from _silent(registry, postgresql, "stuck", count)
+        yield from _silent(registry, postgresql, "cut off", count)
+        yield from _wrong_clocks(registry, count)
 
 
-def _silent(registry: Registry, postgresql: Path, case: str, count: int) -> bool:
+def _silent(registry: Registry, postgresql: Path, case: str, count: int) -> Iterator[Target]:
     with ExitStack() as stack:
         port, forwarder = stack.enter_context(forwarding(postgresql / ".s.PGSQL.5432"))
         url = registry.storage.database_url.replace("@/", f"@127.0.0.1:{port}/").replace(f"host={postgresql}&", "")
@@ -73,11 +71,11 @@ def _silent(registry: Registry, postgresql: Path, case: str, count: int) -> bool
                 unnamed += "silent has been silent for" not in str(error) or "healthy" in str(error)
         os.kill(halted, signal.SIGCONT)
         _promote_everywhere(registry, [*healthy, silent], 1 + count % 2)
-    print(f"{case}: {count} promotions, {false} false confirmations, {unnamed} without its name   (at most 0, 0)")
-    return not false + unnamed
+    yield Target(f"replica {case}: false confirmations", false, at_most=0, note=f"of {count}")
+    yield Target(f"replica {case}: not named", unnamed, at_most=0)
 
 
-def _wrong_clocks(registry: Registry, count: int) -> bool:
+def _wrong_clocks(registry: Registry, count: int) -> Iterator[Target]:
     with ExitStack() as stack:
         replicas = [
             stack.enter_context(standalone_replica(registry.storage, f"clock{hours:+g}", hours)) for hours in CLOCKS
@@ -90,19 +88,18 @@ def _wrong_clocks(registry: Registry, count: int) -> bool:
             except NotReady:
                 missed += 1
                 continue
-            false += len(confirmed) < len(replicas) or any(_version(each) != event.version for each in replicas)
-    shifts = ", ".join(f"{hours:+g} h" for hours in CLOCKS)
-    print(f"clocks {shifts}: {count} promotions, {false} false confirmations, {missed} timeouts   (at most 0, 0)")
-    return not false + missed
+            false += len(confirmed) < len(replicas) or any(_version(replica) != event.version for replica in replicas)
+    yield Target("wrong clocks: false confirmations", false, at_most=0, note=f"of {count}")
+    yield Target("wrong clocks: timeouts", missed, at_most=0)
 
 
 def _promote_everywhere(registry: Registry, replicas: list[StandaloneReplica], version: int) -> None:
     registry.changes.wait_for_alias(promote(registry, version), 30)
-    assert {_version(each) for each in replicas} == {version}
+    assert {_version(replica) for replica in replicas} == {version}
 
 
 def _version(replica: StandaloneReplica) -> int:
-    reply = httpx.post(f"{replica.url}/v1/policies/{LEAGUE}/action", content=BODY)
+    reply = httpx.post(replica.url + ACTION, content=BODY)
     return int(reply.json()["version"])
 
 

@@ -4,7 +4,7 @@ import logging
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -13,16 +13,17 @@ from typing import Any
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
+from benchmarks.harness import Target
 from tests.support.generated_requests import OPERATIONS, draw_request
 from tests.support.servers import postgresql
-from tests.support.servers.two_databases import is_available, outline, replicas_of_both
+from tests.support.servers.two_databases import is_available, replicas_of_both
 
 EXAMPLES = 25
 """Of an operation at a time."""
 
 
-def databases(requests: int) -> bool:
-    """Send generated requests to both; prints differences and server errors. Returns whether there are none."""
+def databases(requests: int) -> Iterator[Target]:
+    """Send generated requests to both; prints the calls that differ or fail."""
     programs = postgresql.programs()
     if programs is None:
         sys.exit("PostgreSQL is not installed")
@@ -38,7 +39,7 @@ def databases(requests: int) -> bool:
 
         def send(data: Any, operation: Any) -> None:
             drawn = draw_request(data, operation)
-            one, other = outline(replicas, drawn.method, drawn.url, drawn.content, drawn.headers)
+            one, other = replicas.outline(drawn.method, drawn.url, drawn.content, drawn.headers)
             statuses[one[0]] += 1
             call = f"{drawn.method} {drawn.url[:200]} {(drawn.content or b'')[:200]!r}"
             if one != other:
@@ -54,9 +55,9 @@ def databases(requests: int) -> bool:
     for line in (*different[:20], *failed[:20]):
         print(f"    {line}")
     sent = ", ".join(f"{count:,} × {status}" for status, count in sorted(statuses.items()))
-    print(f"databases: {sum(statuses.values()):,} generated requests to SQLite and PostgreSQL ({sent})")
-    print(f"    {len(different)} differences (target 0), {len(failed)} server errors (target 0)", flush=True)
-    return not different and not failed
+    note = f"of {sum(statuses.values()):,}: {sent}"
+    yield Target("SQLite and PostgreSQL: different responses", len(different), at_most=0, note=note)
+    yield Target("SQLite and PostgreSQL: server errors", len(failed), at_most=0)
 
 
 def _generate(use: Callable[[Any], None], examples: int, number: int) -> None:

@@ -2,14 +2,14 @@
 
 import subprocess
 import sys
-from pathlib import Path
+from collections.abc import Iterator
 from statistics import median
 
-from benchmarks.leagues.served_league import BODY, LEAGUE
+from benchmarks.harness import Target
+from benchmarks.leagues.served_league import ACTION, BODY
 from benchmarks.load.http import JSON, Load, measure
 from league.registry.registry import Registry
 
-ROOT = Path(__file__).parents[2]
 SLOWER = 2.0
 """Maximum ratio of the 99th percentiles."""
 SIZE = 4 * 2**20 - 1024
@@ -42,31 +42,28 @@ while True:
 """
 
 
-def large_bodies(url: str, registry: Registry, token: str, seconds: float, pairs: int) -> bool:
-    """Print the ratios, by kind of body; whether all are within the limit. token: a key for the normal requests."""
+def large_bodies(url: str, registry: Registry, token: str, seconds: float, pairs: int) -> Iterator[Target]:
+    """The ratios, by kind of body. token: a key for the normal requests."""
     _, attacker = registry.keys.create("attacker", ["act"], rate=RATE)
-    address = f"{url}/v1/policies/{LEAGUE}/action"
+    address = url + ACTION
     headers = {**JSON, "x-api-key": token}
 
     def load() -> Load:
         return measure(address, BODY, connections=8, seconds=seconds, rate=NORMAL_RATE, headers=headers)
 
     load()
-    met = True
     for kind, part in BODIES.items():
-        ratios = []
+        ratios, failed = [], 0
         for _ in range(pairs):
             steady = load()
             with subprocess.Popen(_attack(address, attacker, part)) as attack:
                 attacked = load()
                 attack.kill()
             ratios.append(attacked.p99 / steady.p99)
-            failed = attacked.failed + steady.failed
-        ratio = median(ratios)
-        print(f"4 MB of {kind}: p99 {steady.p99:.2f} ms → {attacked.p99:.2f} ms, {failed} failed; ", end="")
-        print(f"median of {pairs}: {ratio:.2f}×   (at most {SLOWER:g}×)", flush=True)
-        met &= ratio <= SLOWER and not failed
-    return met
+            failed += attacked.failed + steady.failed
+        assert not failed, f"{failed} normal requests failed next to bodies of {kind}"
+        note = f"p99 {steady.p99:.2f} to {attacked.p99:.2f} ms"
+        yield Target(f"p99 beside 4 MB of {kind}", median(ratios), "×", at_most=SLOWER, peer="without", note=note)
 
 
 def _attack(address: str, token: str, part: bytes) -> list[str]:

@@ -8,14 +8,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.leagues.served_league import LEAGUE, fill
-from league.registry.aliases import ANY
+from benchmarks.harness import ROOT
+from benchmarks.leagues.served_league import fill
 from league.registry.registry import Registry
-from league.registry.storage.rows import AliasEvent
 from league.settings import Storage
 from tests.support.servers import postgresql
-
-ROOT = Path(__file__).parents[2]
 
 
 @contextmanager
@@ -30,11 +27,6 @@ def league_in_postgresql(versions: int = 2) -> Iterator[tuple[Registry, Path]]:
         registry = Registry.open(replace(storage, database_url=postgresql.create(socket, "hostile")))
         yield fill(registry, versions), socket
         registry.close()
-
-
-def promote(registry: Registry, version: int) -> AliasEvent:
-    """Make a version the champion."""
-    return registry.aliases.set(LEAGUE, "champion", version, expected=ANY, actor="benchmark", reason="does it follow?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +45,7 @@ def standalone_replica(
 ) -> Iterator[StandaloneReplica]:
     """Run a replica. hours: how far its clock is ahead. prefix: a command that runs it, such as `ip netns exec`."""
     log = storage.home / f"{name}.log"
-    command = [*prefix, sys.executable, "-m", "benchmarks.attacks.replica", name, str(storage.home)]
+    command = [*prefix, sys.executable, "-m", "tests.support.servers.standalone_replica", name, str(storage.home)]
     command += [database_url or storage.database_url, str(storage.artifacts), f"--hours={hours}"]
     with (
         log.open("w") as errors,

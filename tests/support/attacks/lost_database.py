@@ -9,10 +9,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 
-from benchmarks.attacks.confirmations import forwarding
-from benchmarks.attacks.postgresql_leagues import StandaloneReplica, league_in_postgresql, standalone_replica
-from benchmarks.leagues.served_league import BODY, LEAGUE
+from benchmarks.harness import Target
+from benchmarks.leagues.served_league import ACTION, BODY
 from league.registry.registry import Registry
+from tests.support.attacks.confirmations import forwarding
+from tests.support.servers.postgresql_replicas import StandaloneReplica, league_in_postgresql, standalone_replica
 
 NAMESPACE, HERE, THERE = f"league-{os.getpid()}", "10.213.7.1", "10.213.7.2"
 NOTICED, USED = 10.0, 5.0
@@ -34,11 +35,10 @@ print(count, failed)
 """
 
 
-def lost_database(seconds: float, rounds: int) -> bool:
-    """Print the times; whether they are within the limits, and no action was lost. Requires root."""
+def lost_database(seconds: float, rounds: int) -> Iterator[Target]:
+    """The times until the loss is noticed and the connection is used again, and lost actions. Requires root."""
     if os.geteuid() or not shutil.which("ip"):
-        print("lost database: not run, it requires root and the command `ip`")
-        return False
+        sys.exit("the loss of the database requires root and the command `ip`")
     with league_in_postgresql() as (registry, socket), ExitStack() as stack:
         link = stack.enter_context(_namespace())
         port, _ = stack.enter_context(forwarding(socket / ".s.PGSQL.5432", HERE))
@@ -46,12 +46,16 @@ def lost_database(seconds: float, rounds: int) -> bool:
         replica = stack.enter_context(
             standalone_replica(registry.storage, "remote", prefix=_inside(), database_url=url)
         )
-        met = [_round(registry, replica, link, seconds) for _ in range(rounds)]
-    return all(met)
+        results = [_round(registry, replica, link, seconds) for _ in range(rounds)]
+    noticed, used, failed, counts = zip(*results, strict=True)
+    yield Target("dropped packets to PostgreSQL: noticed", noticed, "s", at_most=NOTICED)
+    yield Target("restored connection to PostgreSQL: used", used, "s", at_most=USED)
+    yield Target("dropped packets to PostgreSQL: actions lost", sum(failed), at_most=0, note=f"of {sum(counts):,}")
 
 
-def _round(registry: Registry, replica: StandaloneReplica, link: str, seconds: float) -> bool:
-    address, logged = f"{replica.url}/v1/policies/{LEAGUE}/action", replica.log.stat().st_size
+def _round(registry: Registry, replica: StandaloneReplica, link: str, seconds: float) -> tuple[float, float, int, int]:
+    """Seconds until the loss is noticed, and until the connection is used again; failed calls, and all calls."""
+    address, logged = replica.url + ACTION, replica.log.stat().st_size
     command = [*_inside(), sys.executable, "-c", CALL, address, str(seconds + 10)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as calls:
         assert calls.stdin is not None
@@ -65,24 +69,19 @@ def _round(registry: Registry, replica: StandaloneReplica, link: str, seconds: f
             if noticed == float("inf") and "cannot poll the registry" in replica.log.read_text()[logged:]:
                 noticed = time.monotonic() - cut
             time.sleep(0.05)
-        seen = _seen(registry, replica)
+        last = _seen(registry, replica)
         _ip("link", "set", link, "up")
         restored = time.monotonic()
-        while _seen(registry, replica) == seen and time.monotonic() - restored < 60:
+        while _seen(registry, replica) == last and time.monotonic() - restored < 60:
             time.sleep(0.05)
         used = time.monotonic() - restored
         output, _ = calls.communicate()
     count, failed = map(int, output.split())
-    print(
-        f"connection dropped for {seconds:g} s: noticed after {noticed:.1f} s, used again {used:.1f} s after its ",
-        end="",
-    )
-    print(f"return, {failed} of {count:,} actions lost   (at most {NOTICED:g} s, {USED:g} s, 0)", flush=True)
-    return noticed <= NOTICED and used <= USED and not failed
+    return round(noticed, 1), round(used, 1), failed, count
 
 
 def _seen(registry: Registry, replica: StandaloneReplica) -> datetime | None:
-    return next((each.seen_at for each in registry.replicas.registered() if each.replica == replica.name), None)
+    return next((row.seen_at for row in registry.replicas.registered() if row.replica == replica.name), None)
 
 
 def _inside() -> list[str]:

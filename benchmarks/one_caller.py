@@ -7,30 +7,29 @@ idle_connections  thousands of connections that are idle, or of which nothing ar
 
 Each attack is a module of benchmarks.attacks, which runs in a process of its own:
 
-    python -m benchmarks.attacks.ATTACK URL GRPC_ADDRESS TOKEN
+    python -m tests.support.attacks.ATTACK URL GRPC_ADDRESS TOKEN
 
 It prints a line when it has started, and attacks until it is killed. TOKEN is empty, or a key that allows one request
 per second. A stall is the longest wait of a probe during the attack minus that in a control run before it.
 """
 
-import argparse
+import math
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from statistics import median
 
 import psutil
 
-from benchmarks.leagues.served_league import BODY, LEAGUE, publish
+from benchmarks.harness import Parts, Quick, Target, chosen
+from benchmarks.leagues.served_league import ACTION, BODY, published
 from benchmarks.load.http import JSON
 from benchmarks.load.probe import measure
-from benchmarks.processes import replica_processes
 from serve_app.runtime.haproxy import free_ports
 from serve_app.runtime.launch import running
+from tests.support.servers.processes import replica_processes
 
 ATTACKS = ("grpc_messages", "websocket_pings", "idle_connections")
 NEED_ACCESS = ("websocket_pings",)
@@ -38,8 +37,8 @@ NEED_ACCESS = ("websocket_pings",)
 REPLICAS = 2
 RATE = 1.0
 """Requests per second that the attacker's key allows."""
-GROWTH = 50 * 2**20
-"""Maximum growth of a replica by a caller without a key, in bytes."""
+GROWTH = 50.0
+"""Maximum growth of a replica by a caller without a key, in MB."""
 STALL = {"keyless": 0.1, "keyed": 0.2}
 """Maximum stall, in seconds."""
 SAMPLE = 0.05
@@ -78,38 +77,34 @@ class Growth:
                     self.lost = True
 
 
-def attacked(name: str, url: str, grpc_address: str, token: str, key: str, seconds: float, pairs: int) -> bool:
-    """Print the stall and the growth by one attack with a token; whether both are within the limits.
-
-    key: an API key for the probe.
-    """
+def attacked(
+    name: str, url: str, grpc_address: str, token: str, key: str, seconds: float, pairs: int
+) -> Iterator[Target]:
+    """The stall and the growth by one attack with a token. key: an API key for the probe."""
     who = "keyed" if token else "keyless"
-    action = f"{url}/v1/policies/{LEAGUE}/action"
     headers = {**JSON, "x-api-key": key}
-    measure(action, BODY, 1.0, headers)  # warm-up
+    measure(url + ACTION, BODY, 1.0, headers)  # warm-up
     growth = Growth()
     stalls, statuses = [], set[str]()
     with growth.sampled():
         for _ in range(pairs):
-            control = measure(action, BODY, seconds, headers)
+            control = measure(url + ACTION, BODY, seconds, headers)
             with _attack(name, url, grpc_address, token):
-                probe = measure(action, BODY, seconds, headers)
+                probe = measure(url + ACTION, BODY, seconds, headers)
             stalls.append(probe.longest - control.longest)
             statuses |= {*control.statuses, *probe.statuses}
-    stall = median(stalls)
-    print(f"{name}, {who}: stall {stall:.3f} s, median of {pairs} ", end="")
-    print(f"({min(stalls):.3f} to {max(stalls):.3f}; at most {STALL[who]:g} s); a replica ", end="")
-    print("ended" if growth.lost else f"grew by {growth.largest / 2**20:.1f} MB", end="")
-    print(f" (at most {GROWTH / 2**20:.0f} MB)" if who == "keyless" else "", end="")
-    print(f"; statuses of the probe: {', '.join(sorted(statuses))}", flush=True)
-    has_grown = growth.lost or (who == "keyless" and growth.largest > GROWTH)
-    return stall <= STALL[who] and not has_grown and statuses == {"200"}
+    note = f"{min(stalls):.3f} to {max(stalls):.3f} s"
+    yield Target(f"{name}, {who}: stall", round(median(stalls), 3), "s", at_most=STALL[who], note=note)
+    grown = math.inf if growth.lost else round(growth.largest / 2**20, 1)
+    yield Target(f"{name}, {who}: growth of a replica", grown, "MB", at_most=None if token else GROWTH)
+    failed = sorted(statuses - {"200"})
+    yield Target(f"{name}, {who}: other statuses of the probe", len(failed), at_most=0, note=", ".join(failed))
 
 
 @contextmanager
 def _attack(name: str, url: str, grpc_address: str, token: str) -> Iterator[None]:
     """Run the attack while the context is active."""
-    command = ["nice", sys.executable, "-m", f"benchmarks.attacks.{name}", url, grpc_address, token]
+    command = ["nice", sys.executable, "-m", f"tests.support.attacks.{name}", url, grpc_address, token]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         try:
@@ -120,31 +115,18 @@ def _attack(name: str, url: str, grpc_address: str, token: str) -> Iterator[None
             process.kill()
 
 
-def main() -> int:
-    """Print a line for each attack and caller; 1 if a target was missed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=ATTACKS, action="append", help="an attack; may be repeated")
-    parser.add_argument("--quick", action="store_true", help="smoke test: one pair of short runs")
-    options = parser.parse_args()
-    seconds, pairs = (2.0, 1) if options.quick else (6.0, 5)
+def main(parts: Parts = None, quick: Quick = False) -> Iterator[Target]:
+    """Attack with and without a key."""
+    seconds, pairs = (2.0, 1) if quick else (6.0, 5)
     (grpc_port,) = free_ports(1, "127.0.0.1")
-    with tempfile.TemporaryDirectory() as scratch:
-        registry = publish(Path(scratch) / "home", versions=1)
+    with published() as registry:
         _, key = registry.keys.create("probe", ["act"])
         _, limited = registry.keys.create("attacker", ["act"], rate=RATE)
-        runs = [(name, token) for name in options.only or ATTACKS for token in ("", limited)]
-        met = []
+        runs = [(name, token) for name in chosen(parts, dict.fromkeys(ATTACKS)) for token in ("", limited)]
         for insecure in (False, True):
-            chosen = [run for run in runs if (run[0] in NEED_ACCESS and not run[1]) == insecure]
-            if not chosen:
+            attacks = [run for run in runs if (run[0] in NEED_ACCESS and not run[1]) == insecure]
+            if not attacks:
                 continue
             with running(registry.storage, grpc_port=grpc_port, replicas=REPLICAS, insecure=insecure) as url:
-                met += [
-                    attacked(name, url, f"127.0.0.1:{grpc_port}", token, key, seconds, pairs) for name, token in chosen
-                ]
-        registry.close()
-    return int(not all(met))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+                for name, token in attacks:
+                    yield from attacked(name, url, f"127.0.0.1:{grpc_port}", token, key, seconds, pairs)

@@ -6,20 +6,21 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from sqlalchemy import text
 
+from benchmarks.harness import ROOT, Target
 from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import CONFIG
 from tests.support.servers import postgresql
+from tests.support.waiting import until
 
-ROOT = Path(__file__).parents[2]
 VERSIONS = ({}, {"blocks": True}, {"wins": True}, {"wins": True, "blocks": True})
 DEADLINE = 120.0
 RUN = """
@@ -47,9 +48,9 @@ AND database = (SELECT oid FROM pg_database WHERE datname = current_database())
 TABLES = ("matches", "verdicts", "alias_events", "nightly_runs")
 
 
-def lost_locks(runs: int) -> bool:
-    """Print how many first runs changed something after they had lost their lock; whether none did, and each second run
-    ended like an undisturbed one.
+def lost_locks(runs: int) -> Iterator[Target]:
+    """How many first runs changed something after they had lost their lock, and how many second runs ended unlike an
+    undisturbed one.
     """
     programs = postgresql.programs()
     if programs is None:
@@ -59,12 +60,11 @@ def lost_locks(runs: int) -> bool:
         expected = _undisturbed(_league(Path(scratch) / "quiet", postgresql.create(socket, "quiet")))
         for number in range(runs):
             registry = _league(Path(scratch) / str(number), postgresql.create(socket, f"run_{number}"))
-            changes, found = _disturbed(registry, delay=0.02 * (number % 10))
+            changes, state = _disturbed(registry, delay=0.02 * (number % 10))
             at_work += changes > 0
-            unequal += found != expected
-    print(f"{runs} nightly runs lost their lock: {at_work} changed something afterwards, ", end="")
-    print(f"{unequal} second runs ended differently   (at most 0, 0)")
-    return not at_work + unequal
+            unequal += state != expected
+    yield Target("lost locks: runs that changed something afterwards", at_work, at_most=0, note=f"of {runs}")
+    yield Target("lost locks: different results of the second run", unequal, at_most=0)
 
 
 def _league(home: Path, database_url: str) -> Registry:
@@ -85,12 +85,12 @@ def _disturbed(registry: Registry, delay: float) -> tuple[int, list[tuple[object
     """The number of rows that the first run added after it had lost its lock, and the final state."""
     with ExitStack() as stack:
         first = _run(stack, registry)
-        _until(lambda: _counts(registry)["matches"] > 0)
+        until(lambda: _counts(registry)["matches"] > 0, DEADLINE)
         second = _run(stack, registry)
         time.sleep(delay)
         with registry.database.write() as session:
             session.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({HOLDERS}) AS holders"))
-        _until(lambda: bool(_holders(registry)) or second.poll() is not None)
+        until(lambda: _holders(registry) or second.poll() is not None, DEADLINE)
         os.kill(second.pid, signal.SIGSTOP)
         before = _counts(registry)
         failed = first.wait(DEADLINE) != 0
@@ -125,11 +125,3 @@ def _counts(registry: Registry) -> dict[str, int]:
 def _holders(registry: Registry) -> list[int]:
     with registry.database.read() as session:
         return list(session.execute(text(HOLDERS)).scalars())
-
-
-def _until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + DEADLINE
-    while not condition():
-        if time.monotonic() > deadline:
-            sys.exit("the runs did not proceed")
-        time.sleep(0.002)

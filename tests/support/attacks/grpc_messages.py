@@ -36,11 +36,11 @@ def bodies() -> list[bytes]:
 
 def _field(number: int, content: bytes) -> bytes:
     """A field with a length, as the wire format encodes it."""
-    length, rest = b"", len(content)
-    while rest > 127:
-        length += bytes([rest & 127 | 128])
-        rest >>= 7
-    return bytes([number << 3 | 2]) + length + bytes([rest]) + content
+    length, size = b"", len(content)
+    while size > 127:
+        length += bytes([size & 127 | 128])
+        size >>= 7
+    return bytes([number << 3 | 2]) + length + bytes([size]) + content
 
 
 async def attack(address: str, token: str) -> None:

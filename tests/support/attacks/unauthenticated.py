@@ -1,15 +1,17 @@
 """Calls without a key, with the longest names that the server reads: how much do the replicas grow?"""
 
 import secrets
+from collections.abc import Iterator
 
 import grpc
 import httpx
 
-from benchmarks.processes import replica_processes
+from benchmarks.harness import Target
 from serve_app.inference_protocol import open_inference_pb2 as messages
+from tests.support.servers.processes import replica_processes
 
-GROWTH = 10 * 2**20
-"""Maximum growth of a replica, in bytes."""
+GROWTH = 10.0
+"""Maximum growth of a replica, in MB."""
 PATH = 60_000
 """Characters of a path; HAProxy and uvicorn read headers of about 64 KiB."""
 NAME = 4_000_000
@@ -17,17 +19,16 @@ NAME = 4_000_000
 SERVICE = "/inference.GRPCInferenceService/ModelReady"
 
 
-def unauthenticated(url: str, grpc_address: str, calls: int) -> bool:
-    """Print the growth of the replica that grew most; whether it is within the limit."""
+def unauthenticated(url: str, grpc_address: str, calls: int) -> Iterator[Target]:
+    """The growth of the replica that grew most."""
     with httpx.Client(base_url=url, timeout=30) as client:
         _call_http(client, 4)
         _call_grpc(grpc_address, 4)
-        before = {each.pid: each.memory_info().rss for each in replica_processes()}
+        before = {replica.pid: replica.memory_info().rss for replica in replica_processes()}
         refused = _call_http(client, calls // 2) + _call_grpc(grpc_address, calls - calls // 2)
-    growth = max(each.memory_info().rss - before[each.pid] for each in replica_processes())
-    print(f"{calls} calls without a key, {refused} refused: a replica grew by {growth / 2**20:.1f} MB", end="")
-    print(f"   (at most {GROWTH / 2**20:.0f} MB)")
-    return growth <= GROWTH and refused == calls
+    growth = max(replica.memory_info().rss - before[replica.pid] for replica in replica_processes()) / 2**20
+    yield Target("calls without a key: growth of a replica", round(growth, 1), "MB", at_most=GROWTH)
+    yield Target("calls without a key that were not refused", calls - refused, at_most=0, note=f"of {calls:,}")
 
 
 def _call_http(client: httpx.Client, calls: int) -> int:
