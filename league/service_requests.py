@@ -1,5 +1,9 @@
-"""Requests to the evaluation service: tournaments, nightly runs, recorded games and games against policies."""
+"""Requests to the evaluation service, and its responses: tournaments, nightly runs, recorded games and games of people.
 
+Replicas of the policy server return the responses unchanged.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
@@ -9,6 +13,7 @@ MOST_CONTESTANTS = 256
 MOST_BLOCKS = 100_000
 MOST_GAMES = 10_000_000
 MOST_MINUTES = 365 * 24 * 60
+MOST_SEED = 2**63 - 1
 MOST_NUMBER = 2**31 - 1
 """Largest number of a game or a step."""
 
@@ -18,27 +23,50 @@ class _Request(BaseModel):
 
 
 class _WithReason(_Request):
-    reason: str | None = Field(default=None, min_length=1, max_length=2000, pattern=r"^[^\x00]+$")
-    """A note that is stored with the evaluation."""
+    reason: str | None = Field(
+        default=None,
+        min_length=1,
+        max_length=2000,
+        pattern=r"^[^\x00]+$",
+        description="A note that is stored with the evaluation.",
+    )
 
 
 class TournamentRequest(_WithReason):
-    """Games that update ratings and promote no version. The fields are arguments of `tournament.evaluate`."""
+    """Games that update ratings and promote no version."""
 
     kind: Literal["tournament"] = "tournament"
-    schedule: Literal["round_robin", "gauntlet", "adaptive", "cross_play"] = "round_robin"
-    contestants: tuple[str, ...] = Field(default=(), max_length=MOST_CONTESTANTS)
-    """References to versions and scripts. Empty: every version trained in the league's current environment."""
-    against: tuple[str, ...] = Field(default=(), max_length=MOST_CONTESTANTS)
-    """Opponents of each contestant in a gauntlet. Empty: the champion and the baselines."""
-    blocks: int | None = Field(default=None, ge=1, le=MOST_BLOCKS)
-    """Matches of each pair. None: 32, or as many as the budget allows."""
-    games: int | None = Field(default=None, ge=2, le=MOST_GAMES)
-    minutes: float | None = Field(default=None, gt=0, le=MOST_MINUTES)
-    precision: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    """Target half-width of every rating's 95 % interval, in Elo."""
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    """Another seed plays other games."""
+    schedule: Literal["round_robin", "gauntlet", "adaptive", "cross_play"] = Field(
+        default="round_robin",
+        description="`round_robin`: all pairs. `gauntlet`: each contestant against those in `against`. `adaptive`:"
+        " pairings depend on the results so far. `cross_play`: pairs play in one team.",
+    )
+    contestants: tuple[str, ...] = Field(
+        default=(),
+        max_length=MOST_CONTESTANTS,
+        description="Versions, aliases and scripts: `connect_four@3`, `connect_four@champion`, `script:random`. Empty:"
+        " every version trained in the league's current environment.",
+    )
+    against: tuple[str, ...] = Field(
+        default=(),
+        max_length=MOST_CONTESTANTS,
+        description="For `gauntlet`: the opponents of each contestant. Empty: the champion and the baselines.",
+    )
+    blocks: int | None = Field(
+        default=None,
+        ge=1,
+        le=MOST_BLOCKS,
+        description="Matches of each pair. Null: 32, or as many as the budget allows.",
+    )
+    games: int | None = Field(default=None, ge=2, le=MOST_GAMES, description="Maximum number of games.")
+    minutes: float | None = Field(default=None, gt=0, le=MOST_MINUTES, description="Maximum duration.")
+    precision: float | None = Field(
+        default=None,
+        gt=0,
+        allow_inf_nan=False,
+        description="Stop when the 95 % interval of every rating is within ± this many Elo.",
+    )
+    seed: int = Field(default=0, ge=0, le=MOST_SEED, description="The seed of the games.")
 
     @model_validator(mode="after")
     def _check_combination(self) -> Self:
@@ -74,6 +102,8 @@ class EvaluationRequest(
 
 MOST_STEPS = 100
 """Steps per response. A rendered step may take tens of kilobytes."""
+MOST_CHANCES = 32
+"""Actions per move with probabilities."""
 MOST_CHOICES = 10_000
 """Actions of a person in one game."""
 
@@ -114,18 +144,21 @@ class PlayabilityRequest(_Request):
 
 
 class PlayBody(_Request):
-    """A game of a person against policies, up to the person's next turn.
+    """A game of a person against policies, up to the person's next turn."""
 
-    opponent: reference of the policies that control all other agents. actions: the person's actions so far.
-    seed: seed of the environment and of stochastic policies. chances: include the opponent's action probabilities,
-    also for the person's observations.
-    """
-
-    opponent: str
-    agent: str
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    actions: tuple[Annotated[int, Field(ge=-(2**63), lt=2**63)], ...] = Field(default=(), max_length=MOST_CHOICES)
-    chances: bool = False
+    opponent: str = Field(
+        description="The policies that control all other agents: `connect_four@4`, `connect_four@champion`,"
+        " `script:one_ply`."
+    )
+    agent: str = Field(description="The agent that you play. The opponent plays all others.")
+    seed: int = Field(default=0, ge=0, le=MOST_SEED, description="The seed of the environment and of the scripts.")
+    actions: tuple[Annotated[int, Field(ge=-MOST_SEED - 1, le=MOST_SEED)], ...] = Field(
+        default=(), max_length=MOST_CHOICES, description="Your actions so far."
+    )
+    chances: bool = Field(
+        default=False,
+        description="Return the probabilities of the opponent's actions, and those of the opponent in your position.",
+    )
 
 
 class HumanPlayRequest(PlayBody):
@@ -152,6 +185,130 @@ class GameRequest(_Request):
     def is_cacheable(self) -> bool:
         """Whether its response never changes."""
         return not isinstance(self.operation, PlayabilityRequest)
+
+
+class _Document(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+Chances = Annotated[
+    tuple[tuple[int, Annotated[float, Field(ge=0, le=1)]], ...],
+    Field(
+        max_length=MOST_CHANCES,
+        description="(action, probability) pairs, most probable first, without impossible actions. Empty if no policy"
+        " selected the action.",
+    ),
+]
+Returns = Annotated[Mapping[str, float | None], Field(description="Return by agent.")]
+ActionNames = Annotated[dict[str, str], Field(description="Name by action, a number as text; empty without names.")]
+Picture = Annotated[str | None, Field(description="The picture after the step: a PNG as a data URI, or null.")]
+
+
+class RecordedMove(_Document):
+    """What an agent did in a step."""
+
+    agent: str
+    ref: str = Field(description="The player: a version, a script, or `person`.")
+    action: bool | int | float | list[Any] = Field(description="A number, or nested lists of numbers.")
+    chances: Chances
+
+
+class RecordedStep(_Document):
+    """A step of a game."""
+
+    step: int = Field(ge=0)
+    moves: tuple[RecordedMove, ...] = Field(
+        description="The moves of all agents in this step; empty in step 0, the initial state."
+    )
+    picture: Picture
+    opening: bool = Field(description="Whether the step is part of the random opening.")
+
+
+class GameForfeit(_Document):
+    """An agent that returned no valid action; the game ends there."""
+
+    agent: str
+    ref: str
+    reason: Literal["illegal_action", "not_finite", "malformed", "crashed"]
+
+
+class RecordedGame(_Document):
+    """A recorded game. If it cannot be replayed, `fault` is set and there are no steps."""
+
+    match: str
+    game: int
+    players: dict[str, str] = Field(description="Player by agent.")
+    action_names: dict[str, ActionNames] = Field(
+        description="`play.action_names` of the league by agent; without the agents that have none."
+    )
+    length: int = Field(description="Number of steps of the game, without the initial state.")
+    every: int
+    steps: tuple[RecordedStep, ...] = Field(max_length=MOST_STEPS)
+    returns: Returns
+    forfeits: tuple[GameForfeit, ...]
+    fault: str | None = Field(description="The reason why the game cannot be replayed.")
+
+
+class PlayableAgent(_Document):
+    """An agent that a person can control: its actions are the `actions` integers from `start`."""
+
+    agent: str
+    side: str
+    actions: int = Field(description="Number of actions.")
+    start: int = Field(description="The first action.")
+    names: ActionNames
+    keys: dict[str, int] = Field(
+        description="Action by key, as `KeyboardEvent.key` names it: what the environment declares, and arrow keys and"
+        " WASD for actions whose names contain a direction."
+    )
+    color: str | None = Field(
+        description="Color of the agent in the pictures, if the environment declares it: a color name or `#rrggbb`."
+    )
+
+
+class Playability(_Document):
+    """The agents and opponents for a game with a person, or the reason why the league is not playable."""
+
+    league: str
+    playable: bool
+    why: str | None = Field(description="The reason why the league is not playable.")
+    agents: tuple[PlayableAgent, ...] = Field(description="Agents with a discrete action space.")
+    opponents: tuple[str, ...] = Field(
+        description="Mixtures with an alias, the 50 newest versions of the environment, newest first, then scripts, and"
+        " the bots and remote models that the configuration names."
+    )
+    draws: bool = Field(description="Whether the environment renders pictures.")
+    board: tuple[tuple[int | None, ...], ...] | None = Field(
+        description="A grid of actions in rows over the picture, if the environment declares one; null where no action"
+        " is."
+    )
+    board_area: tuple[float, float, float, float] = Field(
+        description="Where the grid is: left, top, right and bottom, as shares of the picture's width and height."
+    )
+    reveals: bool = Field(
+        description="Whether the pictures show what the environment hides from the agent, because it does not render"
+        " the view of one agent."
+    )
+
+
+class PlayedGame(_Document):
+    """The game of a person so far, and the legal actions."""
+
+    opponent: str = Field(description="The requested opponent; an alias is replaced by its version.")
+    agent: str
+    seed: int
+    steps: tuple[RecordedStep, ...] = Field(description="All steps, without pictures.")
+    picture: Picture
+    legal: tuple[int, ...] = Field(description="The legal actions; empty once the game is over.")
+    acting: tuple[str, ...] = Field(description="The agents that act in this step.")
+    over: bool
+    returns: Returns
+    score: float | None = Field(
+        description="Your score once the game is over: 1, ½ or 0. Null if the league does not compare opponents within"
+        " a game."
+    )
+    chances: Chances
+    forfeits: tuple[GameForfeit, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ time and return to any point.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from evaluation.matches.policy_calls import PolicyFault, action_fault, fault_of
 from evaluation.matches.returns import agent_sides, contestant_returns
 from evaluation.playback.action_names import action_names, direction_keys
-from evaluation.playback.environment_hooks import Area, Board, Declarations, EnvironmentHooks
-from evaluation.playback.recorded_steps import LARGEST, Chances, RecordedStep, likely, step_of
+from evaluation.playback.environment_hooks import Declarations, EnvironmentHooks
+from evaluation.playback.recorded_steps import LARGEST, likely, step_of
 from evaluation.playback.single_game import GameStep, Move, play_game, policy_output
 from evaluation.playback.video import data_uri
-from evaluation.results import Document
 from league.conditions import ActionSelection, action_selection
 from league.config.league import LeagueConfig
 from league.environments.stepping import BatchedEnvironment
@@ -38,48 +37,17 @@ from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.registry.registry import Registry
 from league.results.scoring import scores, scoring
-from league.service_requests import HumanPlayRequest
+from league.service_requests import (
+    GameForfeit,
+    HumanPlayRequest,
+    Playability,
+    PlayableAgent,
+    PlayedGame,
+    RecordedStep,
+)
 from league.spaces import ACTION_MASK, DictSpace, Discrete, Space
 
 MOST_OPPONENTS = 50
-
-
-@dataclass(frozen=True, slots=True)
-class PlayableAgent(Document):
-    """An agent that a person can control: its actions are the `actions` integers from `start`.
-
-    names: action, as text → name; empty without names. keys: `KeyboardEvent.key` → action. color: in the pictures, a
-    colour name or #rrggbb, if the environment declares it.
-    """
-
-    agent: str
-    side: str
-    actions: int
-    start: int
-    names: dict[str, str]
-    keys: dict[str, int]
-    color: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class Playability(Document):
-    """What a person can play in a league.
-
-    why: reason if nothing can be played, else None. opponents: mixtures with an alias, the newest versions that can
-    play, newest first, then scripts. draws: whether the environment renders images. board: rows of actions over the
-    picture, if the environment declares them. board_area: left, top, right and bottom of this grid, as shares of the
-    picture. reveals: whether the pictures show what the environment hides from the agent.
-    """
-
-    league: str
-    playable: bool
-    why: str | None
-    agents: tuple[PlayableAgent, ...]
-    opponents: tuple[str, ...]
-    draws: bool
-    board: Board | None
-    board_area: Area
-    reveals: bool
 
 
 def playability(config: LeagueConfig, registry: Registry, interface: Interface, hooks: EnvironmentHooks) -> Playability:
@@ -119,7 +87,17 @@ def _playable_agents(config: LeagueConfig, interface: Interface, declared: Decla
         keys = direction_keys(own_names) | declared.action_keys
         fitting = {key: action for key, action in keys.items() if space.start <= action < space.start + space.n}
         color = declared.agent_colors.get(agent)
-        agents.append(PlayableAgent(agent, side_of[agent], space.n, space.start, own_names, fitting, color))
+        agents.append(
+            PlayableAgent(
+                agent=agent,
+                side=side_of[agent],
+                actions=space.n,
+                start=space.start,
+                names=own_names,
+                keys=fitting,
+                color=color,
+            )
+        )
     return tuple(agents)
 
 
@@ -129,30 +107,6 @@ MOST_NAMED = 32
 """Legal actions listed in an error."""
 
 
-@dataclass(frozen=True, slots=True)
-class GameState(Document):
-    """State of a game with a person. steps: without images; `picture` is the current one, None without rendering.
-
-    legal: the person's legal actions, empty at the end. acting: agents that act next.
-    chances: the opponent's action probabilities in the person's position, if requested and the opponent is a graph.
-    score: the person's score, 1, ½ or 0, at the end of games that compare contestants; else None.
-    forfeits: agent, reference and reason of an opponent's forfeit.
-    """
-
-    opponent: str
-    agent: str
-    seed: int
-    steps: tuple[RecordedStep, ...]
-    picture: str | None
-    legal: tuple[int, ...]
-    acting: tuple[str, ...]
-    over: bool
-    returns: dict[str, float]
-    score: float | None
-    chances: Chances
-    forfeits: tuple[dict[str, str], ...]
-
-
 def human_play(
     request: HumanPlayRequest,
     config: LeagueConfig,
@@ -160,7 +114,7 @@ def human_play(
     players: Mapping[str, Policy],
     environment: BatchedEnvironment,
     hooks: EnvironmentHooks,
-) -> GameState:
+) -> PlayedGame:
     """Play the game in `environment`, which has `num_envs` 1.
 
     Args:
@@ -188,7 +142,7 @@ def human_play(
     if person.left and not awaiting:
         made = len(request.actions) - person.left
         raise InvalidInput(f"actions: the game ended after {made} of {len(request.actions)} actions")
-    return GameState(
+    return PlayedGame(
         opponent=request.opponent,
         agent=request.agent,
         seed=request.seed,
@@ -200,7 +154,7 @@ def human_play(
         returns=last.returns,
         score=None if awaiting else _score(request.agent, last.returns, forfeit, config, interface),
         chances=likely(Move(request.agent, {}, None, awaiting.inputs), space) if awaiting else (),
-        forfeits=({"agent": forfeit.agent, "ref": request.opponent, "reason": forfeit.fault.reason},)
+        forfeits=(GameForfeit(agent=forfeit.agent, ref=request.opponent, reason=forfeit.fault.reason),)
         if forfeit
         else (),
     )

@@ -3,49 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
 
-from evaluation.playback.action_names import ActionNamesByAgent, action_names
+from evaluation.playback.action_names import action_names
 from evaluation.playback.captions import chances
 from evaluation.playback.replay import GameSource
 from evaluation.playback.single_game import GameStep, Move
 from evaluation.playback.video import data_uri
-from evaluation.results import Document
 from league.environments.stepping import BatchedEnvironment
 from league.errors import one_line
 from league.interface import Interface
 from league.results.records import Match
-from league.service_requests import RecordingRequest
+from league.service_requests import (
+    MOST_CHANCES,
+    Chances,
+    GameForfeit,
+    RecordedGame,
+    RecordedMove,
+    RecordedStep,
+    RecordingRequest,
+)
 from league.spaces import Space
 
 LARGEST = 480
 """Longer side of an image, in pixels."""
-MOST_CHANCES = 32
-"""Actions per move with probabilities."""
-
-Chances = tuple[tuple[int, float], ...]
-"""(action, probability), most probable first, without impossible actions."""
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedMove(Document):
-    """One agent's part of a step. ref: who controlled it."""
-
-    agent: str
-    ref: str
-    action: Any
-    chances: Chances
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedStep(Document):
-    """picture: rendered after the step, as a data URI or None. opening: whether the actions were random."""
-
-    step: int
-    moves: tuple[RecordedMove, ...]
-    picture: str | None
-    opening: bool
 
 
 def step_of(
@@ -54,37 +34,19 @@ def step_of(
     """The document of a step. controllers: agent → who controls it. opening: number of random steps."""
     moves = tuple(
         RecordedMove(
-            move.agent, controllers[move.agent], move.action, likely(move, interface.agents[move.agent].action)
+            agent=move.agent,
+            ref=controllers[move.agent],
+            action=move.action,
+            chances=likely(move, interface.agents[move.agent].action),
         )
         for move in step.moves
     )
-    return RecordedStep(step.step, moves, picture, 0 < step.step <= opening)
+    return RecordedStep(step=step.step, moves=moves, picture=picture, opening=0 < step.step <= opening)
 
 
 def likely(move: Move, space: Space) -> Chances:
     """Action probabilities of a move."""
     return tuple((action, round(chance, 6)) for action, chance in chances(move, space, MOST_CHANCES) if chance > 0)
-
-
-@dataclass(frozen=True, slots=True)
-class RecordedGame(Document):
-    """players: agent → who controlled it. action_names: agent → action, as text → its name. length: steps of the whole
-    game. steps: the requested ones.
-
-    returns: agent → return. forfeits: agent, reference and reason. fault: why the game cannot be replayed; `steps` is
-    empty then.
-    """
-
-    match: str
-    game: int
-    players: dict[str, str]
-    action_names: ActionNamesByAgent
-    length: int
-    every: int
-    steps: tuple[RecordedStep, ...]
-    returns: dict[str, float]
-    forfeits: tuple[dict[str, str], ...]
-    fault: str | None
 
 
 def recorded_steps(
@@ -120,8 +82,8 @@ def recorded_steps(
     )
 
 
-def _forfeits(match: Match, game: int) -> tuple[dict[str, str], ...]:
+def _forfeits(match: Match, game: int) -> tuple[GameForfeit, ...]:
     return tuple(
-        {"agent": forfeit.agent, "ref": match.contestants[forfeit.contestant], "reason": forfeit.reason}
+        GameForfeit(agent=forfeit.agent, ref=match.contestants[forfeit.contestant], reason=forfeit.reason)
         for forfeit in match.games[game].forfeits
     )

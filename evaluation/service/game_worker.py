@@ -22,6 +22,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO
 
+import orjson
+from pydantic import BaseModel
+
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
 from evaluation.matches.worker import MatchWorker
 from evaluation.playback.environment_hooks import EnvironmentHooks, environment_hooks
@@ -29,7 +32,6 @@ from evaluation.playback.human_play import human_play, playability
 from evaluation.playback.recorded_steps import recorded_steps
 from evaluation.playback.replay import recorded_game
 from evaluation.playback.video import write_video
-from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import GameCrashed, GameHung, LeagueError, one_line, to_document
@@ -99,7 +101,7 @@ class GameWorker:
         assert self._hooks is not None, "_ready reads them"
         return self._hooks
 
-    def _recording(self, request: RecordingRequest) -> Document:
+    def _recording(self, request: RecordingRequest) -> BaseModel:
         source = recorded_game(request.match, request.game, self._registry, chances=True)
         match = Ledger(self._registry).match(request.match)
         recording = recorded_steps(source, match, request, self._open, self._shown.draws)
@@ -119,7 +121,7 @@ class GameWorker:
                 raise GameCrashed(f"{source.title} cannot be rendered: {one_line(error, with_type=True)}") from error
             return out.read_bytes()
 
-    def _human_play(self, request: HumanPlayRequest, matches: MatchWorker) -> Document:
+    def _human_play(self, request: HumanPlayRequest, matches: MatchWorker) -> BaseModel:
         opponent = acting_ref(request.opponent, self._registry, f"game {request.seed}")
         policies = {agent: policy for agent, (_, policy) in matches.contestant(opponent).items()}
         try:
@@ -162,9 +164,8 @@ def _within(worker: GameWorker, request: GameRequest, seconds: float) -> GameRes
         raise exceeded.error from None
 
 
-def _json(document: Document) -> GameResponse:
-    content = json.dumps(document.to_json(), allow_nan=False, separators=(",", ":")).encode()
-    return GameResponse("application/json", content)
+def _json(document: BaseModel) -> GameResponse:
+    return GameResponse("application/json", orjson.dumps(document.model_dump()))
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ from onnx import TensorProto, helper, numpy_helper
 from PIL import Image
 
 from evaluation.playback.environment_hooks import Declarations, EnvironmentHooks, environment_hooks
-from evaluation.playback.human_play import PERSON, GameState, human_play, playability
+from evaluation.playback.human_play import PERSON, human_play, playability
 from evaluation.playback.single_game import GameStep, play_game
 from league.conditions import ActionSelection
 from league.config.league import LeagueConfig
@@ -32,7 +32,7 @@ from league.interface import Interface
 from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
-from league.service_requests import HumanPlayRequest
+from league.service_requests import GameForfeit, HumanPlayRequest, PlayedGame
 from league.spaces import inputs
 from tests.support.environments.declaring import EVERYTHING, VIEWS
 from tests.support.leagues import tictactoe
@@ -70,7 +70,7 @@ def scripted_players(described: Interface, name: str = "random") -> dict[str, Po
 
 def play_request(
     entry_point: str, players: Mapping[str, Policy], agent: str, actions: Sequence[int] = (), **options: Any
-) -> GameState:
+) -> PlayedGame:
     kwargs, selection = options.pop("kwargs", {}), options.pop("selection", None)
     config, described, environment = league_and_environment(entry_point, selection, **kwargs)
     request = HumanPlayRequest(opponent="script:random", agent=agent, actions=tuple(actions), **options)
@@ -91,7 +91,7 @@ def moves_of(steps: Sequence[GameStep]) -> list[list[tuple[str, Any]]]:
     return [[(move.agent, move.action) for move in step.moves] for step in steps]
 
 
-def moves_in(state: GameState) -> list[list[tuple[str, Any]]]:
+def moves_in(state: PlayedGame) -> list[list[tuple[str, Any]]]:
     return [[(move.agent, move.action) for move in step.moves] for step in state.steps]
 
 
@@ -241,7 +241,7 @@ def test_a_person_can_play_only_agents_with_discrete_actions() -> None:
 def test_an_opponent_without_a_legal_action_forfeits() -> None:
     players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph(faulty=True)))
     state = play_request(TICTACTOE, players, "player_1", [1, 5, 8])
-    assert state.forfeits == ({"agent": "player_2", "ref": "script:random", "reason": "illegal_action"},)
+    assert state.forfeits == (GameForfeit(agent="player_2", ref="script:random", reason="illegal_action"),)
     assert state.score == 1.0
 
 

@@ -62,7 +62,7 @@ def test_each_step_has_actions_and_probabilities(registry: Registry) -> None:
                 assert move.chances[0][0] == move.action, "checkpoints act greedily"
                 assert sum(chance for _, chance in move.chances) == pytest.approx(1, abs=1e-4)
         assert (record.fault, set(record.returns.values())) == (None, set(game.returns))
-        json.dumps(record.to_json(), allow_nan=False)
+        json.dumps(record.model_dump(), allow_nan=False)
 
 
 def test_recurrent_state_starts_after_the_opening(registry: Registry) -> None:
@@ -135,7 +135,7 @@ def test_forfeits_are_reported(registry: Registry) -> None:
     )
     book = record_steps(registry, match, number)
     (forfeit,) = book.forfeits
-    assert (forfeit["ref"], forfeit["reason"], book.players[forfeit["agent"]]) == (
+    assert (forfeit.ref, forfeit.reason, book.players[forfeit.agent]) == (
         "tictactoe@2",
         "illegal_action",
         "tictactoe@2",
