@@ -1,14 +1,15 @@
 """MkDocs hooks: pages link to files of the repository, and the site contains what they link to.
 
-CONTRIBUTING.md and CHANGELOG.md become pages, and the page Modules is made from docstrings. Every other file outside of
-`docs/` that a page links to becomes a page with its source. A link to a file that does not exist stays as it is, so
-that the strict build fails.
+CONTRIBUTING.md and CHANGELOG.md become pages. The page Modules is made from docstrings, and the page HTTP reference
+from the declared routes. Every other file outside of `docs/` that a page links to becomes a page with its source. A
+link to a file that does not exist stays as it is, so that the strict build fails.
 """
 
 import posixpath
 import re
 from pathlib import Path
 
+from http_reference import page as http_reference
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
@@ -27,6 +28,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name in PAGES:
         linked |= set(_links((ROOT / name).read_text(), ROOT / name))
     files.append(File.generated(config, "modules.md", content=module_index()))
+    files.append(File.generated(config, "http-reference.md", content=http_reference()))
     for name, uri in PAGES.items():
         files.append(File.generated(config, uri, content=(ROOT / name).read_text()))
     for path in sorted(path for path in linked if not path.is_relative_to(DOCS) and path.exists()):

@@ -20,7 +20,7 @@ from ray.serve.handle import DeploymentHandle
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.responses import RedirectResponse
-from starlette.routing import Match, Route, Router, WebSocketRoute
+from starlette.routing import Match, Router
 from starlette.types import Receive, Scope, Send
 
 from league.errors import ConfigError
@@ -32,6 +32,7 @@ from serve_app.access.access_control import AccessControl, AccessControlMiddlewa
 from serve_app.access.access_log import AccessLog
 from serve_app.access.api_keys import ApiKeyCache
 from serve_app.access.errors import ErrorHandlers
+from serve_app.access.permissions import Permissions
 from serve_app.evaluation_client import EvaluationClient, ServeEvaluationClient
 from serve_app.inference import stream_session
 from serve_app.inference.stream_session import StreamDependencies
@@ -39,7 +40,7 @@ from serve_app.inference_protocol import grpc_handlers, inference
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.grpc_service import InferenceService
 from serve_app.inference_protocol.inference import Inference
-from serve_app.inference_protocol.rest import RestRoutes
+from serve_app.inference_protocol.rest import InferRoute, RestRoutes
 from serve_app.inference_protocol.statistics import REPORT
 from serve_app.models.action_selections import ActionSelections
 from serve_app.models.alias_slots import AliasSlots
@@ -52,33 +53,27 @@ from serve_app.models.version_cache import VersionCache, load
 from serve_app.observability.load import LoadSampler
 from serve_app.observability.metrics import Metrics, Report
 from serve_app.observability.metrics_reporter import MetricsReporter
+from serve_app.openapi.document import document
 from serve_app.routes import action
 from serve_app.routes.action import ActionDispatch, ActionRoute
-from serve_app.routes.aliases import AliasRoutes
+from serve_app.routes.endpoints import routes_of
 from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.events import EventBroker, EventRoutes
 from serve_app.routes.games import GameRoutes
-from serve_app.routes.leagues import LeagueRoutes
-from serve_app.routes.nights import NightRoutes
 from serve_app.routes.pages import DocsRoutes, PageRoutes
-from serve_app.routes.results import ResultRoutes
-from serve_app.routes.runs import RunRoutes
 from serve_app.routes.status import StatusRoutes
 from serve_app.routes.stream import StreamRoute
+from serve_app.routes.table import OF_REGISTRY, ROUTES
 from serve_app.routes.traffic import TrafficRoutes
-from serve_app.routes.verdicts import VerdictRoutes
 from serve_app.runtime import autoscaling, ray_serve, serve_bypass, uvicorn_http, uvicorn_websocket
 from serve_app.runtime.replica_process import ReplicaProcess, this_process
 from serve_app.settings import ServeSettings, is_exposed
 
 LOOPBACK = "127.0.0.1"
-ROUTES = {
-    action.API: "/v1/policies/{model}/action",
-    stream_session.API: "/v1/policies/{model}/stream",
-    inference.API: "/v2/models/{model}/infer",
-}
-"""Route of each kind of inference request in Ray's metrics; gRPC counts as `infer`."""
-GAME_PATH = "/v1/leagues/{league}/matches/{schedule}/{position}/games/{game}"
+NAMES = {action.API: "act", stream_session.API: "stream", inference.API: "infer"}
+"""Name of the route of each kind of inference request; gRPC counts as `infer`."""
+PATHS = {route.name: route.path for route in ROUTES}
+"""Path of each route, for Ray's metrics."""
 SWITCH_INTERVAL = 0.0005
 """Thread switch interval in seconds. With Python's default of 5 ms, threads that query the database or compute a shadow
 would delay the slowest requests by as much."""
@@ -152,7 +147,7 @@ class PolicyServer(ray_serve.AsgiReplica):
         if sample is None:
             return {}
         for api, count in sample.requests.items():
-            self._count_requests(ROUTES[api], count)
+            self._count_requests(PATHS[NAMES[api]], count)
         return {autoscaling.LOAD: sample.load, ray_serve.RUNNING_REQUESTS: sample.in_progress}
 
 
@@ -216,7 +211,7 @@ class Replica:
             on_replicas=lambda number: self.stream.replicas_counted(number),
             is_draining=is_draining,
         )
-        self.access = AccessControl(self.api_keys, settings, is_exposed)
+        self.access = AccessControl(self.api_keys, settings, Permissions(ROUTES), is_exposed)
         self.action = ActionRoute(self.models, self.access, self.shadow, self.metrics, settings, replica)
         dependencies = StreamDependencies(
             self.models, self.alias_slots, self.traffic, self.shadow, self.metrics, self.access, settings
@@ -227,8 +222,7 @@ class Replica:
             self.connection, self.metrics, self.shadow, self._in_flight, self._statistics, replica, settings
         )
         self._load = LoadSampler(self.metrics)
-        self.evaluations = EvaluationRoutes(self.models, settings, evaluation_client)
-        self.games = GameRoutes(self.models, evaluation_client)
+        self._evaluation_client = evaluation_client
         self.events = EventBroker(self.models, settings)
         self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings, self.reporter.report)
         self.inference_service = InferenceService(
@@ -252,25 +246,22 @@ class Replica:
 
     def application(self) -> Starlette:
         """The ASGI application, which follows the registry's aliases while it runs."""
-        docs = DocsRoutes(self.alias_slots, self.access, self.settings)
-        status = StatusRoutes(self.models, self.watcher, self.access, self.replica)
-        open_inference = RestRoutes(
-            self.inference, self.catalogue, self.watcher, self.access, self.settings, self.replica
+        owners = (
+            self.action,
+            self.stream,
+            InferRoute(self.inference, self.access, self.settings, self.replica),
+            RestRoutes(self.inference, self.catalogue, self.watcher),
+            *OF_REGISTRY,
+            TrafficRoutes(self.models, self.metrics, self.shadow, self.replica),
+            EvaluationRoutes(self.models, self.settings, self._evaluation_client),
+            EventRoutes(self.events, self.access),
+            GameRoutes(self.models, self._evaluation_client),
+            StatusRoutes(self.models, self.watcher, self.access, self.replica),
+            DocsRoutes(self.alias_slots, self.access, partial(document, self.settings)),
+            PageRoutes(),
         )
         application = Starlette(
-            routes=[
-                Route("/v1/policies/{model}/action", self.action, methods=["POST"]),
-                WebSocketRoute("/v1/policies/{model}/stream", self.stream),
-                *open_inference.routes(),
-                *self._league_routes(),
-                Route("/v1/key", status.key),
-                Route("/docs", docs.docs),
-                Route("/openapi.json", docs.openapi),
-                Route("/metrics", status.metrics),
-                Route("/v1/health/live", status.live),
-                Route("/v1/health/ready", status.ready),
-                *PageRoutes().routes(),
-            ],
+            routes=[route for owner in owners for route in routes_of(owner, self.models)],
             middleware=[
                 Middleware(AccessControlMiddleware, self.access, self.errors, self.settings, self.access_log),
                 Middleware(ActionDispatch, self.action),
@@ -280,48 +271,6 @@ class Replica:
         )
         _redirect_slashes(application.router)
         return application
-
-    def _league_routes(self) -> list[Route]:
-        leagues = LeagueRoutes(self.models)
-        results = ResultRoutes(self.models)
-        verdicts = VerdictRoutes(self.models)
-        runs = RunRoutes(self.models)
-        nights = NightRoutes(self.models)
-        aliases = AliasRoutes(self.models)
-        traffic = TrafficRoutes(self.models, self.metrics, self.shadow, self.replica)
-        events = EventRoutes(self.events, self.access)
-        return [
-            Route("/v1/leagues", leagues.page),
-            Route("/v1/leagues/{league}", leagues.get),
-            Route("/v1/leagues/{league}/versions", leagues.versions),
-            Route("/v1/leagues/{league}/versions/{version}/note", leagues.put_note, methods=["PUT"]),
-            Route("/v1/leagues/{league}/leaderboard", results.leaderboard),
-            Route("/v1/leagues/{league}/payoff", results.payoff),
-            Route("/v1/leagues/{league}/ratings", results.ratings),
-            Route("/v1/leagues/{league}/verdicts", verdicts.page),
-            Route("/v1/leagues/{league}/verdicts/{verdict}", verdicts.get),
-            Route("/v1/leagues/{league}/matches", results.matches),
-            Route("/v1/leagues/{league}/matches/{schedule}/{position}", results.match),
-            Route("/v1/leagues/{league}/runs", runs.page),
-            Route("/v1/leagues/{league}/runs/{run}", runs.get),
-            Route("/v1/leagues/{league}/nights", nights.page),
-            Route("/v1/leagues/{league}/nightly-runs", nights.nightly_runs),
-            Route("/v1/leagues/{league}/aliases/{alias}/history", aliases.history),
-            Route("/v1/leagues/{league}/aliases/{alias}", aliases.move, methods=["POST"]),
-            Route("/v1/leagues/{league}/rollback", aliases.roll_back, methods=["POST"]),
-            Route("/v1/leagues/{league}/traffic", traffic.show),
-            Route("/v1/leagues/{league}/traffic", traffic.put, methods=["POST"]),
-            Route("/v1/leagues/{league}/evaluations", self.evaluations.page),
-            Route("/v1/leagues/{league}/evaluations", self.evaluations.start, methods=["POST"]),
-            Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.get),
-            Route("/v1/leagues/{league}/evaluations/{evaluation}", self.evaluations.stop, methods=["DELETE"]),
-            Route("/v1/leagues/{league}/evaluations/{evaluation}/events", events.evaluation),
-            Route("/v1/leagues/{league}/events", events.league),
-            Route(GAME_PATH, self.games.recording),
-            Route(f"{GAME_PATH}/video.gif", self.games.video),
-            Route("/v1/leagues/{league}/playable", self.games.playability),
-            Route("/v1/leagues/{league}/play", self.games.play, methods=["POST"]),
-        ]
 
     @asynccontextmanager
     async def _running(self, _: Starlette) -> AsyncIterator[None]:

@@ -20,7 +20,9 @@ from typer.core import TyperGroup
 from league.config.algorithms import ALGORITHMS
 from league.config.league import LeagueConfig
 from policy_league.cli.main import app
+from serve_app.openapi.document import document
 from serve_app.runtime import haproxy_script
+from serve_app.settings import ServeSettings
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -95,9 +97,17 @@ def test_the_readme_is_short() -> None:
     assert len(README.read_text().splitlines()) <= 120
 
 
+MODULE_INDEX, HTTP_REFERENCE = (
+    runpy.run_path(str(ROOT / f"scripts/{name}.py"))["page"] for name in ("module_index", "http_reference")
+)
+MADE = {DOCS / "modules.md": MODULE_INDEX, DOCS / "http-reference.md": HTTP_REFERENCE}
+"""Pages that scripts/mkdocs_hooks.py makes from the code."""
+
+
 @cache
 def anchors(page: Path) -> set[str]:
-    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.S | re.M)
+    text = MADE[page]() if page in MADE else page.read_text()
+    text = re.sub(r"^```.*?^```", "", text, flags=re.S | re.M)
     return {slugify(heading.replace("`", ""), "-") for heading in re.findall(r"^#+ (.+)$", text, flags=re.M)}
 
 
@@ -107,7 +117,7 @@ def test_each_link_has_a_target(page: Path) -> None:
         if target.startswith(("http:", "https:")):
             continue
         linked = (page.parent / target).resolve() if target else page
-        assert linked.exists(), f"{name_of(page)} links to {target}"
+        assert linked in MADE or linked.exists(), f"{name_of(page)} links to {target}"
         if anchor:
             assert anchor in anchors(linked), f"{name_of(page)} links to {target}#{anchor}"
 
@@ -115,11 +125,12 @@ def test_each_link_has_a_target(page: Path) -> None:
 def test_each_page_is_in_the_navigation() -> None:
     text = (ROOT / "mkdocs.yml").read_text()
     listed = re.findall(r"[\w/-]+\.md$", text, flags=re.M)
-    assert sorted(listed) == sorted({*(page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")), *COPIED})
+    pages = {page.relative_to(DOCS).as_posix() for page in (*DOCS.rglob("*.md"), *MADE)}
+    assert sorted(listed) == sorted(pages | COPIED)
 
 
-COPIED = {"contributing.md", "changelog.md", "modules.md"}
-"""Pages that scripts/mkdocs_hooks.py makes from CONTRIBUTING.md, CHANGELOG.md and the docstrings of modules."""
+COPIED = {"contributing.md", "changelog.md"}
+"""Pages that scripts/mkdocs_hooks.py makes from CONTRIBUTING.md and CHANGELOG.md."""
 
 
 @pytest.mark.slow
@@ -185,9 +196,6 @@ def test_each_training_setting_is_documented_with_its_default(name: str) -> None
         shown = yaml.safe_load(rows[key]) if rows[key] != "–" else None
         default = model.model_validate({"algorithm": name}).model_dump(by_alias=True)[key]
         assert model.model_validate({"algorithm": name, key: shown}).model_dump(by_alias=True)[key] == default
-
-
-MODULE_INDEX = runpy.run_path(str(ROOT / "scripts/module_index.py"))["page"]
 
 
 def test_each_module_is_in_the_module_index() -> None:
@@ -257,21 +265,20 @@ def test_a_walkthrough_links_to_at_most_five_files(page: Path) -> None:
     assert 1 <= len(set(re.findall(r"\]\((\.\./\.\./[^)]+)\)", page.read_text()))) <= 5
 
 
-def test_each_route_and_error_of_the_server_is_documented() -> None:
+def test_each_documented_call_of_the_server_exists() -> None:
     text = (DOCS / "http.md").read_text()
-    openapi = yaml.safe_load((ROOT / "serve_app/openapi/openapi.yaml").read_text())
-    known = {
-        (method.upper(), path)
-        for path, calls in openapi["paths"].items()
-        for method in calls
-        if path.startswith("/v1/") and method != "parameters"
-    }
+    paths = document(ServeSettings(), [])["paths"]
+    operations = {(method.upper(), path) for path, item in paths.items() for method in item if method != "parameters"}
     calls = set(re.findall(r"\b(GET|POST|PUT|DELETE) +(/v1/[^\s`?]*)", text))
-    assert known - calls == {("GET", "/v1/policies/{model}/stream")}
-    assert {call for call in calls if "…" not in call[1]} <= known
+    assert calls
+    assert {call for call in calls if "…" not in call[1]} <= operations
+
+
+def test_each_error_of_the_server_is_documented() -> None:
+    text = (DOCS / "http.md").read_text()
     codes = set(re.findall(r"`([a-z_]+)`", text.partition("\n## Errors\n")[2].partition("\n## ")[0]))
     of_haproxy = {code for _, code, _ in haproxy_script.ERRORS.values()}
-    assert codes == set(error_codes(openapi)) | of_haproxy | {"method_not_allowed"}
+    assert codes == set(error_codes(document(ServeSettings(), []))) | of_haproxy | {"method_not_allowed"}
 
 
 def error_codes(node: Any) -> Iterator[str]:

@@ -9,7 +9,6 @@ The timeout applies to HTTP requests only: gRPC calls have their own deadlines, 
 long-lived.
 """
 
-import re
 from collections.abc import Awaitable, Iterable
 from contextlib import nullcontext
 from time import monotonic
@@ -18,13 +17,12 @@ from typing import Any, NamedTuple
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from league.errors import DeadlineExceeded, Forbidden, InvalidInput, LeagueError, RateLimited, Unauthenticated
-from serve_app.access import permissions
 from serve_app.access.access_log import LOG_ENTRY, AccessLog
 from serve_app.access.api_keys import ApiKey, ApiKeyCache, TokenBucket
 from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.access.errors import BodyTooSlow, ErrorHandlers
 from serve_app.access.load_shedding import Backlog
-from serve_app.access.permissions import RequiredPermission
+from serve_app.access.permissions import Permissions, RequiredPermission, for_rpc
 from serve_app.access.request_body import BODY_READ
 from serve_app.access.request_origin import ORIGIN_HEADERS, reject_cross_site, reject_foreign_host
 from serve_app.codecs.request_limits import LARGE_BODY
@@ -43,8 +41,6 @@ NO_SNIFFING = (b"x-content-type-options", b"nosniff")
 DENIAL = "websocket.http.response"
 """ASGI extension that sends an HTTP response when a WebSocket handshake is refused."""
 POLICY_VIOLATION = 1008
-EVENT_STREAM_PATH = re.compile("/v1/leagues/[^/]+/(evaluations/[^/]+/)?events")
-"""Paths of event streams."""
 UNLIMITED = ("/v1/policies/", "/v2/models/", "/v1/health/", "/v2/health/")
 """Paths of inference, which limits its requests in flight itself, and of health checks, which answer at once."""
 FRAMES = 2000.0
@@ -54,10 +50,16 @@ INVALID_KEY = "the API key is unknown, revoked or expired"
 
 
 class AccessControl:
-    """Decides which requests are accepted. `is_exposed`: whether the server listens to other machines."""
+    """Decides which requests are accepted.
 
-    def __init__(self, api_keys: ApiKeyCache, settings: ServeSettings, is_exposed: bool) -> None:
+    permissions: those that routes require. is_exposed: whether the server listens to other machines.
+    """
+
+    def __init__(
+        self, api_keys: ApiKeyCache, settings: ServeSettings, permissions: Permissions, is_exposed: bool
+    ) -> None:
         self._api_keys = api_keys
+        self._permissions = permissions
         self._settings = settings
         self._is_exposed = is_exposed
         self.backlog = Backlog(settings.max_waiting, settings.max_turn, settings.burst_tolerance)
@@ -88,17 +90,20 @@ class AccessControl:
             self.backlog.admit()
         return key
 
-    def admit_request(self, scope: Scope, headers: "RequestHeaders") -> ApiKey | None:
+    def requirement(self, scope: Scope) -> RequiredPermission:
+        """The permission that an HTTP request or a WebSocket handshake requires."""
+        return self._permissions.for_request(scope["type"], scope.get("method", "GET"), _path(scope))
+
+    def admit_request(self, scope: Scope, need: RequiredPermission, headers: "RequestHeaders") -> ApiKey | None:
         """Accept an HTTP request or a WebSocket handshake, and return its key.
 
         Raises UntrustedHost, CrossSiteRequest, and the errors of `admit`.
         """
-        method = scope.get("method", "GET")
         if self.is_local_only:
             reject_foreign_host(scope["headers"])
         if headers.is_browser:
-            reject_cross_site(scope["type"], method, scope["headers"])
-        return self.admit(permissions.for_request(scope["type"], method, _path(scope)), headers.token)
+            reject_cross_site(scope["type"], scope.get("method", "GET"), scope["headers"])
+        return self.admit(need, headers.token)
 
     def admit_message(self, key: ApiKey | None, size: int) -> None:
         """Accept a message of a stream that was opened with `key`. size: in bytes.
@@ -157,7 +162,7 @@ class AccessControl:
 
         Raises Unauthenticated, Forbidden, RateLimited or Overloaded.
         """
-        need = permissions.for_rpc(rpc, "")
+        need = for_rpc(rpc, "")
         key = self._identify(need, _read_headers(headers_of(metadata)).token)
         if key is not None:
             _take_token(key)
@@ -168,7 +173,7 @@ class AccessControl:
     def check_model(self, key: ApiKey | None, rpc: str, model: str) -> None:
         """Check that the key of an accepted RPC permits a model. Raises Forbidden."""
         if key is not None:
-            _check_league(key, permissions.for_rpc(rpc, model))
+            _check_league(key, for_rpc(rpc, model))
 
     def _identify(self, need: RequiredPermission, token: bytes | None) -> ApiKey | None:
         """The key that a permission requires, None if it requires none. Raises Unauthenticated or Forbidden."""
@@ -221,20 +226,19 @@ class AccessControlMiddleware:
             send = self._log.begin(scope, _path(scope), send)
         response = ResponseTracker(send)
         try:
-            headers = _read_headers(scope["headers"])
-            key = self._access.admit_request(scope, headers)
+            headers, need = _read_headers(scope["headers"]), self._access.requirement(scope)
+            key = self._access.admit_request(scope, need, headers)
             if key is not None:
                 scope[KEY] = key
                 response.add_header(KEY_ACCEPTED.encode(), b"1")
                 if self._log is not None:
                     scope[LOG_ENTRY]["key"] = key.name
-            path = _path(scope)
-            if kind != "http" or is_event_stream(path):
+            if kind != "http" or need.is_stream:
                 await self._application(scope, receive, response.send)
                 return
             timeout = self._timeout if headers.timeout is None else min(_seconds(headers.timeout), self._timeout)
             scope[DEADLINE] = monotonic() + timeout
-            with nullcontext() if path.startswith(UNLIMITED) else self._in_flight.opened(None):
+            with nullcontext() if _path(scope).startswith(UNLIMITED) else self._in_flight.opened(None):
                 await run_within(timeout, self._application(scope, receive, response.send))
         except LeagueError as error:
             if response.has_started:
@@ -271,11 +275,6 @@ class ResponseTracker:
             self.has_started = True
             message["headers"] = [*message.get("headers", ()), *self._headers]
         return self._send(message)
-
-
-def is_event_stream(path: str) -> bool:
-    """Whether a path is that of an event stream, which has no end of its own."""
-    return path.endswith("/events") and EVENT_STREAM_PATH.fullmatch(path) is not None
 
 
 def _check_league(key: ApiKey, need: RequiredPermission) -> None:

@@ -1,21 +1,18 @@
 """The permission that a request requires: a scope, and the league that it concerns. Pure functions.
 
-act       POST …/action, …/infer and …/play; streams
-read      other GET and HEAD requests; the model repository index
-evaluate  POST and DELETE of evaluations; always requires a key
-promote   changes of aliases, traffic and notes, which always require a key; and any other request, so that a new
-          path is protected by default
-(none)    health checks, the API description, the web pages, and the permissions of the presented key
+Routes declare their scopes. An unknown path requires `read` to be read, and `promote` otherwise, so that it is
+protected by default.
 """
 
+import re
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import NamedTuple
 
-HEALTH_PREFIXES = ("/v1/health/", "/v2/health/")
-PUBLIC_PATHS = ("/docs", "/openapi.json", "/", "/leagues", "/v1/key")
-PAGE_PREFIXES = ("/leagues/", "/pages/")
-AUDITED = ("aliases", "rollback", "traffic", "versions")
-"""Paths below a league whose changes are recorded with the name of the key."""
+from starlette.routing import compile_path
+
+from serve_app.declaration import EVENT_STREAM, Declaration
+
 MAX_CACHED = 256
 """Length of the longest path or model whose permission is cached. Requests without a key are cached, too, and their
 paths may have 64 kB and model names 4 MB."""
@@ -31,29 +28,49 @@ class RequiredPermission(NamedTuple):
     """Whether the request concerns all leagues."""
     is_change: bool = False
     """Whether the request changes what is served, played or recorded, which always requires a key."""
+    is_stream: bool = False
+    """Whether the response is an event stream, which has no end of its own."""
 
 
 PUBLIC = RequiredPermission(None, None)
 
 
-def for_request(kind: str, method: str, path: str) -> RequiredPermission:
-    """The permission for a request. `kind` is the ASGI scope type; `path` is relative to the root path."""
-    return (_for_request if len(path) <= MAX_CACHED else _for_request.__wrapped__)(kind, method, path)
+class Permissions:
+    """The permissions that declared routes require."""
+
+    def __init__(self, declarations: Iterable[Declaration]) -> None:
+        self._declared: dict[str, list[tuple[re.Pattern[str], Declaration]]] = {}
+        for declaration in declarations:
+            pattern, _, _ = compile_path(declaration.path)
+            self._declared.setdefault(declaration.method, []).append((pattern, declaration))
+        self._cached = lru_cache(maxsize=4096)(self._for_request)  # the same few paths recur
+
+    def for_request(self, kind: str, method: str, path: str) -> RequiredPermission:
+        """The permission for a request. `kind` is the ASGI scope type; `path` is relative to the root path."""
+        return (self._cached if len(path) <= MAX_CACHED else self._for_request)(kind, method, path)
+
+    def _for_request(self, kind: str, method: str, path: str) -> RequiredPermission:
+        kind_of_route = "WEBSOCKET" if kind == "websocket" else "GET" if method == "HEAD" else method
+        routes = self._declared.get(kind_of_route, ())
+        declaration = next((declaration for pattern, declaration in routes if pattern.match(path)), None)
+        league = league_of(path)
+        if declaration is None:
+            scope = {"WEBSOCKET": "act", "GET": "read"}.get(kind_of_route, "promote")
+            return RequiredPermission(scope, league, league is None)
+        if declaration.scope is None:
+            return PUBLIC
+        return RequiredPermission(
+            declaration.scope,
+            league,
+            league is None and declaration.is_of_all,
+            declaration.is_change,
+            declaration.media == EVENT_STREAM,
+        )
 
 
 def for_rpc(rpc: str, model: str) -> RequiredPermission:
     """The permission for an RPC of GRPCInferenceService; `model` is empty if it names none."""
     return (_for_rpc if len(model) <= MAX_CACHED else _for_rpc.__wrapped__)(rpc, model)
-
-
-@lru_cache(maxsize=4096)  # the same few paths recur
-def _for_request(kind: str, method: str, path: str) -> RequiredPermission:
-    if (path.startswith(HEALTH_PREFIXES + PAGE_PREFIXES) or path in PUBLIC_PATHS) and method in ("GET", "HEAD"):
-        return PUBLIC
-    league = league_of(path)
-    scope = _scope(kind, method, path)
-    is_change = scope == "evaluate" or (scope == "promote" and _is_below_league(path, AUDITED))
-    return RequiredPermission(scope, league, league is None and path != "/v2", is_change)
 
 
 @lru_cache(maxsize=4096)
@@ -63,25 +80,6 @@ def _for_rpc(rpc: str, model: str) -> RequiredPermission:
     scope = "act" if rpc == "ModelInfer" else "read"
     league = model.partition(".")[0] or None
     return RequiredPermission(scope, league, league is None and rpc != "ServerMetadata")
-
-
-def _scope(kind: str, method: str, path: str) -> str:
-    if kind == "websocket":
-        return "act"
-    if method in ("GET", "HEAD") or path == "/v2/repository/index":
-        return "read"
-    is_action = path.startswith("/v1/policies/") and path.endswith("/action")
-    is_inference = path.startswith("/v2/models/") and path.endswith("/infer")
-    if is_action or is_inference or (method == "POST" and _is_below_league(path, ("play",))):
-        return "act"
-    is_evaluation = method in ("POST", "DELETE") and _is_below_league(path, ("evaluations",))
-    return "evaluate" if is_evaluation else "promote"
-
-
-def _is_below_league(path: str, names: tuple[str, ...]) -> bool:
-    """Whether a path is `/v1/leagues/L/NAME` or below it, for one of the names."""
-    parts = path.split("/")
-    return parts[1:3] == ["v1", "leagues"] and len(parts) > 4 and parts[4] in names
 
 
 def league_of(path: str) -> str | None:

@@ -1,19 +1,15 @@
 """Routes of the Open Inference Protocol over REST, below /v2.
 
-    GET   v2, v2/health/live, v2/health/ready, v2/models/M[/versions/V], …/ready, …/config, …/stats, v2/models/stats
-    POST  v2/models/M[/versions/V]/infer, v2/repository/index
-
-M is `{league}` or `{league}.{policy}`; V is a number or an alias, by default the champion. Statistics are sums
-over all replicas. Errors are `{"error": "…"}`.
+A model is `{league}` or `{league}.{policy}`; a version is a number or an alias, by default the champion. Statistics are
+sums over all replicas. Errors are `{"error": "…"}`.
 """
 
 import asyncio
-from typing import Any
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, TypeVar
 
-import orjson
 from starlette.requests import Request
-from starlette.responses import Response
-from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from league.errors import InvalidInput, NotReady
@@ -21,6 +17,7 @@ from serve_app.access.access_control import KEY, AccessControl
 from serve_app.access.access_log import LOG_ENTRY, log_version
 from serve_app.access.request_body import MAX_CHANGE_BODY, parse_json_object, read_bytes
 from serve_app.codecs.request_limits import LARGE_BODY
+from serve_app.declaration import CALLER, REPLICA_HEADER, TIMEOUT, Declaration, Parameter
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferResponse
@@ -29,85 +26,164 @@ from serve_app.models.registry_watcher import RegistryWatcher
 from serve_app.settings import ServeSettings
 
 JSON, BINARY = b"application/json", b"application/octet-stream"
+BODIES = (JSON.decode(), BINARY.decode())
 HEADER_LENGTH = b"inference-header-content-length"
 LENGTH_DIGITS = 10
 """Maximum digits of a length header."""
 
 
+TAG = "Open Inference Protocol"
+Handler = TypeVar("Handler", bound=Callable[..., Any])
+
+
+def of_model_and_version(declaration: Declaration) -> Callable[[Handler], Handler]:
+    """Declare a route of a model, and the same of one of its versions."""
+    of_version = replace(
+        declaration,
+        path=declaration.path.replace("{model}", "{model}/versions/{version}"),
+        name=f"version_{declaration.name.removeprefix('model_')}",
+        summary=declaration.summary.replace("model", "version"),
+    )
+    return lambda handler: declaration(of_version(handler))
+
+
 class RestRoutes:
     """The endpoints."""
 
-    def __init__(
-        self,
-        inference: Inference,
-        catalogue: ModelCatalogue,
-        watcher: RegistryWatcher,
-        access: AccessControl,
-        settings: ServeSettings,
-        replica: str,
-    ) -> None:
-        self._infer = InferRoute(inference, access, settings, replica)
+    def __init__(self, inference: Inference, catalogue: ModelCatalogue, watcher: RegistryWatcher) -> None:
         self._inference = inference
         self._catalogue = catalogue
         self._watcher = watcher
 
-    def routes(self) -> list[Route]:
-        """Routes for Starlette, the most frequent first."""
-        infer = [
-            Route(f"{model}/infer", self._infer, methods=["POST"])
-            for model in ("/v2/models/{model}", "/v2/models/{model}/versions/{version}")
-        ]
-        server = [
-            Route("/v2", self._server),
-            Route("/v2/health/live", self._live),
-            Route("/v2/health/ready", self._ready),
-            Route("/v2/repository/index", self._index, methods=["POST"]),
-            Route("/v2/models/stats", self._statistics),
-        ]
-        of_models = [
-            Route(f"{model}{path}", endpoint)
-            for model in ("/v2/models/{model}", "/v2/models/{model}/versions/{version}")
-            for path, endpoint in (
-                ("", self._metadata),
-                ("/ready", self._model_ready),
-                ("/config", self._config),
-                ("/stats", self._statistics),
-            )
-        ]
-        return [*infer, *server, *of_models]
+    @Declaration(
+        "GET",
+        "/v2",
+        "ServerMetadata",
+        scope="read",
+        tag=TAG,
+        success="The name and the extensions.",
+        is_of_all=False,
+    )
+    async def server_metadata(self, _: Request) -> Any:
+        """Get server metadata."""
+        return self._catalogue.server()
 
-    async def _server(self, _: Request) -> Response:
-        return _json(self._catalogue.server())
+    @Declaration("GET", "/v2/health/live", "ServerLive", scope=None, tag="Server", success="The process responds.")
+    async def server_live(self, _: Request) -> Any:
+        """Liveness check."""
+        return {"live": True}
 
-    async def _live(self, _: Request) -> Response:
-        return _json({"live": True})
-
-    async def _ready(self, _: Request) -> Response:
+    @Declaration(
+        "GET",
+        "/v2/health/ready",
+        "ServerReady",
+        scope=None,
+        tag="Server",
+        success="All versions that the registry names are loaded.",
+        errors=(NotReady,),
+    )
+    async def server_ready(self, _: Request) -> Any:
+        """Readiness check."""
         if not self._watcher.is_ready:
             raise NotReady("this replica has not loaded the registry's aliases yet")
-        return _json({"ready": True})
+        return {"ready": True}
 
-    async def _model_ready(self, request: Request) -> Response:
-        model, version = _named(request)
-        await self._inference.find(model, version)
-        return _json({"name": model, "ready": True})
-
-    async def _metadata(self, request: Request) -> Response:
-        return _json(await self._catalogue.metadata(*_named(request)))
-
-    async def _config(self, request: Request) -> Response:
-        return _json(await self._catalogue.config(*_named(request)))
-
-    async def _statistics(self, request: Request) -> Response:
-        return _json(await self._catalogue.statistics(*_named(request)))
-
-    async def _index(self, request: Request) -> Response:
+    @Declaration(
+        "POST",
+        "/v2/repository/index",
+        "RepositoryIndex",
+        scope="read",
+        tag=TAG,
+        success="The index.",
+        body="IndexRequest",
+        is_body_optional=True,
+    )
+    async def repository_index(self, request: Request) -> Any:
+        """List all versions of all policies."""
         body = await read_bytes(request.scope, request.receive, MAX_CHANGE_BODY)
         options = parse_json_object(body) if body else {}
         only_ready = False if (ready := options.pop("ready", None)) is None else ready
         if any(value is not None for value in options.values()) or type(only_ready) is not bool:
             raise InvalidInput('the body must be {"ready": true}, {"ready": false} or empty')
-        return _json(await self._catalogue.index(only_ready))
+        return await self._catalogue.index(only_ready)
+
+    @Declaration(
+        "GET",
+        "/v2/models/stats",
+        "Statistics",
+        scope="read",
+        tag=TAG,
+        name="all_statistics",
+        summary="Get statistics of all models",
+        success="The statistics.",
+    )
+    @of_model_and_version(
+        Declaration(
+            "GET",
+            "/v2/models/{model}/stats",
+            "Statistics",
+            scope="read",
+            tag=TAG,
+            name="model_statistics",
+            summary="Get statistics of a model",
+            success="The statistics.",
+        )
+    )
+    async def statistics(self, _: Request, model: str = "", version: str = "") -> Any:
+        """Get statistics.
+
+        Sums over the replicas, each since it started. Times are in nanoseconds.
+        """
+        return await self._catalogue.statistics(model, version)
+
+    @of_model_and_version(
+        Declaration(
+            "GET",
+            "/v2/models/{model}",
+            "ModelMetadata",
+            scope="read",
+            tag=TAG,
+            name="model_metadata",
+            summary="Get metadata of a model",
+            success="The inputs, outputs and versions.",
+        )
+    )
+    async def metadata(self, _: Request, model: str, version: str = "") -> Any:
+        """Get the names, datatypes and shapes of inputs and outputs."""
+        return await self._catalogue.metadata(model, version)
+
+    @of_model_and_version(
+        Declaration(
+            "GET",
+            "/v2/models/{model}/ready",
+            "ModelReady",
+            scope="read",
+            tag=TAG,
+            name="model_ready",
+            summary="Readiness check of a model",
+            success="The model is ready.",
+        )
+    )
+    async def ready(self, _: Request, model: str, version: str = "") -> Any:
+        """Readiness check."""
+        await self._inference.find(model, version)
+        return {"name": model, "ready": True}
+
+    @of_model_and_version(
+        Declaration(
+            "GET",
+            "/v2/models/{model}/config",
+            "ModelConfig",
+            scope="read",
+            tag=TAG,
+            name="model_config",
+            summary="Get the configuration of a model",
+            success="The configuration in the format of Triton.",
+        )
+    )
+    async def config(self, _: Request, model: str, version: str = "") -> Any:
+        """Get the configuration."""
+        return await self._catalogue.config(model, version)
 
 
 class InferRoute:
@@ -119,8 +195,50 @@ class InferRoute:
         self._settings = settings
         self._replica = (REPLICA, replica.encode())
 
+    @of_model_and_version(
+        Declaration(
+            "POST",
+            "/v2/models/{model}/infer",
+            "InferResponse",
+            scope="act",
+            tag=TAG,
+            name="infer",
+            summary="Run inference with a model",
+            success="The requested outputs, by default all, as JSON or as JSON followed by binary tensors.",
+            media=BODIES,
+            headers=(
+                REPLICA_HEADER,
+                Parameter(
+                    "Inference-Header-Content-Length",
+                    {"type": "integer"},
+                    "Length of the JSON part in bytes, if binary tensors follow it.",
+                ),
+            ),
+            parameters=(
+                Parameter(
+                    "Inference-Header-Content-Length",
+                    {"type": "integer", "minimum": 0, "maximum": 10**LENGTH_DIGITS - 1},
+                    "Length of the JSON part in bytes; required if binary tensors follow it.",
+                    "header",
+                ),
+                CALLER,
+                TIMEOUT,
+            ),
+            body="InferRequest",
+            body_media=BODIES,
+        )
+    )
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a POST. Raises LeagueError."""
+        """Run inference.
+
+        Inputs must have the names, datatypes and shapes of `GET /v2/models/{model}`, with a leading batch dimension;
+        they are not converted. Omit recurrent state at the start of episodes; afterwards send `state_out_<i>` back as
+        `state_in_<i>`.
+
+        The body is JSON, optionally followed by binary tensors; then `Inference-Header-Content-Length` is the length of
+        the JSON part. Request (`Content-Encoding: gzip` or `deflate`) and response (`Accept-Encoding`) can be
+        compressed.
+        """
         with self._inference.admitted():
             await self._handle(scope, receive, send)
 
@@ -168,12 +286,3 @@ def _headers(scope: Scope) -> tuple[int | None, bytes]:
         elif name == b"accept-encoding":
             accepted = value
     return header_length, accepted
-
-
-def _named(request: Request) -> tuple[str, str]:
-    """Model and version of a path, empty if absent."""
-    return request.path_params.get("model", ""), request.path_params.get("version", "")
-
-
-def _json(document: Any) -> Response:
-    return Response(orjson.dumps(document), media_type="application/json")

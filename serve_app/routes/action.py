@@ -18,12 +18,13 @@ from typing import Any
 import orjson
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import NotReady, Overloaded
+from league.errors import IllegalMask, InvalidState, NotReady, ObservationError, Overloaded
 from league.refs import CHAMPION
 from serve_app.access.access_control import KEY, AccessControl
 from serve_app.access.access_log import LOG_ENTRY, log_version
 from serve_app.access.request_body import parse_json_object, read_body
 from serve_app.codecs.request_limits import LARGE_BODY
+from serve_app.declaration import CALLER, REPLICA_HEADER, TIMEOUT, VERSION, Declaration
 from serve_app.inference.action_request import (
     KEYS,
     REPLICA,
@@ -42,7 +43,7 @@ from serve_app.models.resolver import ModelResolver
 from serve_app.models.shadow import MirrorFunction, Shadow
 from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.observability.metrics import Metrics
-from serve_app.routes import parsing
+from serve_app.routes.query_string import query_params
 from serve_app.settings import ServeSettings
 
 PATH_PREFIX, PATH_SUFFIX = "/v1/policies/", "/action"
@@ -71,8 +72,34 @@ class ActionRoute:
         self.in_flight = 0
         """Requests in flight."""
 
+    @Declaration(
+        "POST",
+        f"{PATH_PREFIX}{{model}}{PATH_SUFFIX}",
+        "ActionResponse",
+        scope="act",
+        tag="Inference",
+        name="act",
+        success="The actions in the order of the observations.",
+        headers=(REPLICA_HEADER,),
+        parameters=(VERSION, CALLER, TIMEOUT),
+        body="ActionRequest",
+        errors=(ObservationError, IllegalMask, InvalidState),
+    )
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a POST. Raises LeagueError."""
+        """Compute actions.
+
+        `model` is a league, or `league.policy` if its versions have several policies. Without `version` the champion is
+        used. The call has no side effects, so it can be retried.
+
+        **Observations.** Arrays are nested lists or base64. `{"b64": "…"}` contains the bytes of the array (row-major,
+        little-endian); `dtype` and `shape` are optional and must match the policy. `{"png": "…"}` contains an image
+        with 8 bits per channel (grayscale, grayscale with alpha, RGB or RGBA), and `{"png": ["…", "…"]}` several images
+        that are stacked along the last axis.
+
+        **Recurrent policies** return `state`, a token. Send it with the next observation; omit it (or send null) at the
+        start of an episode. The version that issued the token serves the episode until it ends, even if `champion`
+        changes.
+        """
         if self.in_flight >= self._settings.max_in_flight:
             raise Overloaded(f"{self.in_flight} requests are in progress in this replica")
         self.in_flight += 1
@@ -85,7 +112,7 @@ class ActionRoute:
         start = perf_counter_ns()
         turn = self._access.backlog.turn
         body = await read_body(scope, receive, self._settings.max_body)
-        model, requested = scope["path_params"]["model"], parsing.query_params(scope).get("version", CHAMPION)
+        model, requested = scope["path_params"]["model"], query_params(scope).get("version", CHAMPION)
         if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
             self._access.admit_body(scope.get(KEY), len(body))
         document = await self._parse_large(body, model, requested) if is_large else parse_json_object(body)

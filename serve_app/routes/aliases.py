@@ -1,54 +1,58 @@
 """Moves aliases (promotion, rollback) and lists their history.
 
-    GET   /v1/leagues/{league}/aliases/{alias}/history    newest first; ?limit= &before=
-                                                          ?at=2026-03-03T14:00:00Z: the event in force at that time
-    POST  /v1/leagues/{league}/aliases/{alias}   {"version": 3, "expected": 2, "reason": "…"}
-                                                          {"members": [{"version": 3, "probability": 0.6}, …]}
-    POST  /v1/leagues/{league}/rollback          {"expected": 3, "reason": "…"}
-
-POST requires an API key of scope `promote`, whose name becomes the actor in the history, and an `Idempotency-Key`: a
-repeated call (a retry by a client or by HAProxy) is not applied again and gets the same response for 24 hours.
+A change requires an API key of scope `promote`, whose name becomes the actor in the history, and an `Idempotency-Key`:
+a repeated call (a retry by a client or by HAProxy) is not applied again and gets the same response for 24 hours.
 `expected` is the version that the alias must point to now, or null if it must not exist; without it there is no such
 condition.
 """
 
-from collections.abc import Callable
-from typing import Any, Self
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
 
-from league.errors import InvalidInput
-from league.refs import MAX_VERSION, check_alias, check_slug
+from league.errors import (
+    AliasMoved,
+    EnvironmentMismatch,
+    InvalidInput,
+    LeagueArchived,
+    NothingToRollBack,
+    NotPromotable,
+    UnknownVersion,
+    VersionRetired,
+)
+from league.refs import MAX_VERSION
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
+from league.registry.storage import rows
 from league.registry.storage.idempotency import IdempotentCall
-from league.registry.storage.rows import AliasEvent
-from serve_app.access.access_control import DEADLINE
-from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
-from serve_app.models.resolver import ModelResolver
-from serve_app.routes import parsing
+from serve_app.access.api_keys import ApiKey
+from serve_app.declaration import Declaration, Page, Response, moment
+from serve_app.routes.documents import ChangeBody, Number
 
 MAX_MEMBERS = 100
 """Members of a mixture."""
+NumberInBody = Annotated[int, Field(ge=1, le=MAX_VERSION, description="The number of a version.")]
 
 
 class MemberBody(BaseModel):
-    """A member of a mixture."""
+    """A version of a mixture, and its probability. The probabilities of a mixture sum to 1."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    version: int = Field(ge=1, le=MAX_VERSION)
+    version: NumberInBody
     probability: float = Field(gt=0, le=1)
 
 
-class PromotionBody(parsing.ChangeBody):
-    """The body of a promotion, of a version or of a mixture."""
+class PromotionBody(ChangeBody):
+    """A version or a mixture that an alias is to name: either `version` or `members`."""
 
-    version: int | None = Field(default=None, ge=1, le=MAX_VERSION)
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["version"]}, {"required": ["members"]}]})
+
+    version: NumberInBody | None = None
     members: list[MemberBody] | None = Field(default=None, max_length=MAX_MEMBERS)
-    expected: int | None = Field(default=None, ge=1, le=MAX_VERSION)
+    expected: NumberInBody | None = Field(default=None, description="The version that the alias must currently name.")
 
     @model_validator(mode="after")
     def _has_one_target(self) -> Self:
@@ -67,94 +71,94 @@ class PromotionBody(parsing.ChangeBody):
         return registry.publisher.publish_mixture(league, shares).number
 
 
-class RollbackBody(parsing.ChangeBody):
-    """The body of a rollback."""
+class RollbackBody(ChangeBody):
+    """A return to the previous champion."""
 
-    expected: int | None = Field(default=None, ge=1, le=MAX_VERSION)
-
-
-class AliasRoutes:
-    """The endpoints. Access control requires the scope `promote` for POST."""
-
-    def __init__(self, models: ModelResolver) -> None:
-        self._models = models
-
-    async def history(self, request: Request) -> Response:
-        """A page of an alias's events. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        alias = check_alias(request.path_params["alias"])
-        limit, before = parsing.page_size(request), parsing.query_number(request, "before")
-        at = parsing.query_time(request, "at")
-        if at is not None and before is not None:
-            raise InvalidInput("at and before are mutually exclusive")
-
-        def query(registry: Registry) -> dict[str, Any]:
-            rows = registry.aliases.history(league, alias, at, before=before, limit=limit + 1)
-            page, more = parsing.paginate(rows, limit, lambda row: row.id)
-            return {"league": league, "alias": alias, "history": list(map(event_document, page)), "next": more}
-
-        return await parsing.query_response(self._models, query)
-
-    async def move(self, request: Request) -> JSONResponse:
-        """Point an alias at a version or a mixture.
-
-        Raises UnknownLeague, UnknownVersion, VersionRetired, NotPromotable, EnvironmentMismatch, AliasMoved,
-        KeyReused or InvalidInput.
-        """
-        league = check_slug("league", request.path_params["league"])
-        alias = check_alias(request.path_params["alias"])
-        body = parsing.parse_body(PromotionBody, await self._body(request))
-        expected = body.expected if "expected" in body.model_fields_set else ANY
-
-        def change(registry: Registry, actor: str, call: IdempotentCall) -> AliasEvent:
-            return registry.aliases.set(
-                league,
-                alias,
-                body.target(registry, league),
-                expected=expected,
-                actor=actor,
-                reason=body.reason,
-                call=call,
-            )
-
-        return await self._apply(request, body, change)
-
-    async def roll_back(self, request: Request) -> JSONResponse:
-        """Restore the previous champion.
-
-        Raises UnknownLeague, AliasMoved, NothingToRollBack, KeyReused or InvalidInput.
-        """
-        league = check_slug("league", request.path_params["league"])
-        body = parsing.parse_body(RollbackBody, await self._body(request) or b"{}")
-        expected = ANY if body.expected is None else body.expected
-
-        def change(registry: Registry, actor: str, call: IdempotentCall) -> AliasEvent:
-            return registry.aliases.rollback(league, expected=expected, actor=actor, reason=body.reason, call=call)
-
-        return await self._apply(request, body, change)
-
-    async def _body(self, request: Request) -> bytes:
-        return await read_body(request.scope, request.receive, MAX_CHANGE_BODY)
-
-    async def _apply(
-        self, request: Request, body: parsing.ChangeBody, change: Callable[[Registry, str, IdempotentCall], AliasEvent]
-    ) -> JSONResponse:
-        key, call = parsing.idempotent_call(request, body)
-        event = await self._models.change(lambda registry: change(registry, key.name, call), request.scope[DEADLINE])
-        return JSONResponse(event_document(event))
+    expected: NumberInBody | None = Field(default=None, description="The version that the champion must currently be.")
 
 
-def event_document(event: AliasEvent) -> dict[str, Any]:
-    """An alias event as JSON."""
-    return {
-        "league": event.league,
-        "alias": event.alias,
-        "kind": event.kind,
-        "version": event.version,
-        "previous": event.previous,
-        "actor": event.actor,
-        "reason": event.reason,
-        "verdict": event.verdict,
-        "at": event.at.isoformat(),
-        "event": event.id,
-    }
+class AliasChange(Response):
+    """A change of an alias."""
+
+    league: str
+    alias: str
+    kind: str
+    version: Number
+    previous: int | None
+    actor: str
+    reason: str
+    verdict: str | None = Field(description="The verdict that led to the promotion.")
+    at: datetime
+    event: int = Field(validation_alias="id")
+
+
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/aliases/{alias}/history",
+    Page("history", AliasChange, "event"),
+    scope="read",
+    tag="Read",
+    success="A page of the history.",
+    parameters=(moment("at", "A time with a time zone.", "2026-03-03T14:00:00Z"),),
+)
+def history(
+    registry: Registry, league: str, alias: str, limit: int, before: int | None, at: datetime | None
+) -> Sequence[rows.AliasEvent]:
+    """Get the history of an alias.
+
+    Newest first; empty for an alias that never existed. With `at`, only the change that was in effect at that time.
+    """
+    if at is not None and before is not None:
+        raise InvalidInput("at and before are mutually exclusive")
+    return registry.aliases.history(league, alias, at, before=before, limit=limit)
+
+
+@Declaration(
+    "POST",
+    "/v1/leagues/{league}/aliases/{alias}",
+    AliasChange,
+    scope="promote",
+    tag="Management",
+    body=PromotionBody,
+    errors=(UnknownVersion, VersionRetired, NotPromotable, EnvironmentMismatch, AliasMoved, LeagueArchived),
+)
+def set_alias(
+    registry: Registry, league: str, alias: str, body: PromotionBody, key: ApiKey, call: IdempotentCall
+) -> rows.AliasEvent:
+    """Point an alias to a version or a mixture.
+
+    A compare-and-set operation: with `expected`, the alias must currently name this version; with `expected: null`, it
+    must not exist. Without `expected` the alias is set unconditionally. With `members`, a mixture is published as a
+    version of its own, unless it exists, and the alias points to it.
+    """
+    return registry.aliases.set(
+        league,
+        alias,
+        body.target(registry, league),
+        expected=body.expected if "expected" in body.model_fields_set else ANY,
+        actor=key.name,
+        reason=body.reason,
+        call=call,
+    )
+
+
+@Declaration(
+    "POST",
+    "/v1/leagues/{league}/rollback",
+    AliasChange,
+    scope="promote",
+    tag="Management",
+    body=RollbackBody,
+    is_body_optional=True,
+    errors=(AliasMoved, NothingToRollBack),
+)
+def roll_back(
+    registry: Registry, league: str, body: RollbackBody, key: ApiKey, call: IdempotentCall
+) -> rows.AliasEvent:
+    """Roll back to the previous champion.
+
+    With `expected`, the champion must currently be this version: of several rollbacks of one version, only the first
+    succeeds.
+    """
+    expected = ANY if body.expected is None else body.expected
+    return registry.aliases.rollback(league, expected=expected, actor=key.name, reason=body.reason, call=call)

@@ -1,65 +1,152 @@
-"""JSON documents that several routes return: evaluations, verdicts and traffic settings."""
+"""Models of JSON documents that several routes take or return."""
 
-from typing import Any
+from datetime import datetime
+from typing import Annotated, Any, Literal
 
-from league.registry.storage.mixture import Mixture
-from league.registry.storage.rows import EvaluationRow, Portion, Traffic, VerdictRow
+from pydantic import BaseModel, ConfigDict, Field
+
+from league.conditions import ActionSelection
+from league.refs import MAX_VERSION
+from league.registry.storage.rows import EvaluationState, VerdictRow
+from serve_app.declaration import NUMBER_OR_ALIAS, Response
 
 OPEN = "open"
 
-
-def evaluation_document(row: EvaluationRow) -> dict[str, Any]:
-    """An evaluation as JSON, with its result."""
-    return evaluation_summary(row) | {"result": row.result}
-
-
-def evaluation_summary(row: EvaluationRow) -> dict[str, Any]:
-    instants = {"created_at": row.created_at, "started_at": row.started_at, "ended_at": row.ended_at}
-    return {
-        "league": row.league,
-        "evaluation": row.id,
-        "state": row.state,
-        "request": row.request,
-        "progress": row.progress,
-        "error": row.error,
-        "actor": row.actor,
-        "reason": row.reason,
-        "workers": row.workers,
-        "stopped_by": row.stopped_by,
-        "heartbeat_at": row.heartbeat_at and row.heartbeat_at.isoformat(),
-    } | {name: instant and instant.isoformat() for name, instant in instants.items()}
+Number = Annotated[int, Field(ge=1, le=MAX_VERSION, description="The number of a version.")]
+Aliases = dict[str, Number]
+Interval = Annotated[
+    tuple[float | None, float | None] | None, Field(description="95 % interval; an infinite bound is null.")
+]
+ComputedAt = Annotated[
+    datetime | None,
+    Field(description="When the evaluation service computed this; null before the first computation."),
+]
+StoredTime = Annotated[str, Field(json_schema_extra={"format": "date-time"})]
+"""A time in a document that another process has computed."""
+Selection = Annotated[
+    ActionSelection,
+    Field(
+        description="How versions select actions in matches, and by default in requests. Versions without an action"
+        " distribution are always greedy."
+    ),
+]
 
 
-def verdict_summary(row: VerdictRow) -> dict[str, Any]:
-    """The decision of a verdict as JSON."""
+class StoredDocument(Response):
+    """A document that another process has computed, and to which it may add fields."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class Error(Response):
+    """An error."""
+
+    model_config = ConfigDict(extra="allow")
+
+    code: str = Field(description="Stable error code.")
+    message: str = Field(description="Human-readable message.")
+
+
+class MixtureMember(Response):
+    """A version of a mixture, and its probability. The probabilities of a mixture sum to 1."""
+
+    version: Number
+    probability: float = Field(gt=0, le=1)
+
+
+class EvaluationProgress(StoredDocument):
+    """The progress of the games of a schedule."""
+
+    what: str
+    played: int = Field(description="Number of completed matches.")
+    of: int = Field(description="Maximum number of matches.")
+    moves_per_second: float | None = Field(
+        default=None, description="Actions of all games per second, since this process started this schedule."
+    )
+    llr: float | None = Field(default=None, description="For a verdict: the current value of its test.")
+    bounds: tuple[float, float] | None = None
+
+
+class EvaluationSummary(Response):
+    """An evaluation without its result."""
+
+    league: str
+    evaluation: int = Field(validation_alias="id")
+    state: EvaluationState
+    request: dict[str, Any] = Field(description="The request, with aliases replaced by versions.")
+    progress: EvaluationProgress | None
+    error: Error | None = Field(description="The reason for a failure.")
+    actor: str = Field(description="The key that started the evaluation.")
+    reason: str | None
+    workers: int | None = Field(description="Number of worker processes.")
+    stopped_by: str | None = Field(description="The key that stopped the evaluation.")
+    created_at: datetime
+    started_at: datetime | None
+    heartbeat_at: datetime | None = Field(description="The last heartbeat of its process.")
+    ended_at: datetime | None
+
+
+class Evaluation(EvaluationSummary):
+    """An evaluation."""
+
+    result: dict[str, Any] | None = Field(description="The report of the evaluation.")
+
+
+class VerdictDecision(Response):
+    """What a verdict decided."""
+
+    verdict: str
+    candidate: str
+    opponent: str
+    outcome: Literal["open", "promote", "reject", "inconclusive", "void"]
+    promoted: bool = Field(description="Whether the candidate became champion.")
+    opened_at: datetime
+    closed_at: datetime | None
+
+
+class Share(Response):
+    """A version, and its share of requests."""
+
+    version: Number | Annotated[str, Field(json_schema_extra=NUMBER_OR_ALIAS)] = Field(
+        description="The number of a version, or an alias."
+    )
+    share: float = Field(ge=0, le=1)
+
+
+class TrafficSetting(Response):
+    """A setting of canary and shadow."""
+
+    league: str
+    setting: int | None = Field(validation_alias="id")
+    canary: Share | None
+    shadow: Share | None
+    actor: str | None
+    reason: str | None
+    at: datetime | None
+
+
+class ChangeBody(BaseModel):
+    """A change of what is served."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    reason: str = Field(
+        default="over HTTP",
+        min_length=1,
+        max_length=2000,
+        pattern=r"^[^\x00]+$",
+        description="Recorded in the history.",
+    )
+
+
+def decision(row: VerdictRow) -> dict[str, Any]:
+    """The fields of a VerdictDecision."""
     return {
         "verdict": row.id,
-        "candidate": f"{row.league}@{row.candidate}",
+        "candidate": row.candidate_ref,
         "opponent": row.champion,
         "outcome": row.outcome or OPEN,
         "promoted": bool((row.evidence or {}).get("promoted")),
-        "opened_at": row.opened_at.isoformat(),
-        "closed_at": row.closed_at and row.closed_at.isoformat(),
+        "opened_at": row.opened_at,
+        "closed_at": row.closed_at,
     }
-
-
-def members_document(mixture: Mixture) -> list[dict[str, Any]]:
-    """The members of a mixture as JSON."""
-    return [{"version": member.version, "probability": member.probability} for member in mixture.members]
-
-
-def traffic_document(setting: Traffic) -> dict[str, Any]:
-    """A traffic setting as JSON."""
-    return {
-        "league": setting.league,
-        "setting": setting.id,
-        "canary": _portion_document(setting.canary),
-        "shadow": _portion_document(setting.shadow),
-        "actor": setting.actor,
-        "reason": setting.reason,
-        "at": setting.at and setting.at.isoformat(),
-    }
-
-
-def _portion_document(portion: Portion | None) -> dict[str, Any] | None:
-    return None if portion is None else {"version": portion.version, "share": portion.share}

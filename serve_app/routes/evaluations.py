@@ -1,38 +1,73 @@
 """Starts, lists and stops evaluations: games between versions of a league, played by the evaluation service.
 
-    POST    /v1/leagues/{league}/evaluations        {"contestants": ["connect_four@3", "script:one_ply"], "blocks": 64}
-    GET     /v1/leagues/{league}/evaluations        newest first; ?limit= &before=
-    GET     /v1/leagues/{league}/evaluations/{evaluation}
-    DELETE  /v1/leagues/{league}/evaluations/{evaluation}
-
 A request is validated, written to the registry, and played by the evaluation service; any replica reports its progress.
-Starting and stopping require a key of scope `evaluate`; a nightly run also requires the scope `promote`.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
+import orjson
 from starlette.requests import Request
-from starlette.responses import JSONResponse
+from starlette.responses import Response
 
-from league.errors import Forbidden
+from league.errors import (
+    EnvironmentMismatch,
+    Forbidden,
+    NoEvaluationService,
+    TooManyEvaluations,
+    UnknownAlias,
+    UnknownEvaluation,
+    UnknownPolicy,
+    UnknownVersion,
+)
 from league.policies.loading import eligible, requested
-from league.refs import check_slug
 from league.registry.registry import Registry
+from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import EvaluationRow
 from league.service_requests import EvaluationRequest, NightlyRequest, TournamentRequest
-from serve_app.access.access_control import DEADLINE, KEY
+from serve_app.access.access_control import DEADLINE
 from serve_app.access.api_keys import ApiKey
-from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
+from serve_app.declaration import Declaration, Page, Parameter
 from serve_app.evaluation_client import EvaluationClient, require_client
 from serve_app.models.resolver import ModelResolver
-from serve_app.routes import documents, parsing
+from serve_app.routes.documents import Evaluation, EvaluationSummary
 from serve_app.settings import ServeSettings
 
-PAGE, MAX_PAGE = 20, 100
+
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/evaluations",
+    Page("evaluations", EvaluationSummary, "evaluation", size=20, largest=100),
+    scope="read",
+    tag="Evaluation",
+)
+def evaluations(registry: Registry, league: str, limit: int, before: int | None) -> Sequence[EvaluationRow]:
+    """List evaluations.
+
+    Newest first, without results.
+    """
+    return registry.evaluations.newest(league, before=before, limit=limit)
+
+
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/evaluations/{evaluation}",
+    Evaluation,
+    scope="read",
+    tag="Evaluation",
+    errors=(UnknownEvaluation,),
+)
+def evaluation(registry: Registry, league: str, evaluation: int) -> EvaluationRow:
+    """Get an evaluation.
+
+    The progress and, once the state is `done`, the `result`: ratings and payoffs; for a nightly run also verdicts and
+    the champion.
+    """
+    return registry.evaluations.get(league, evaluation)
 
 
 class EvaluationRoutes:
-    """The endpoints. Access control requires the scope `evaluate` for POST and DELETE."""
+    """The endpoints that notify the evaluation service."""
 
     def __init__(
         self, models: ModelResolver, settings: ServeSettings, evaluation_client: EvaluationClient | None
@@ -41,27 +76,51 @@ class EvaluationRoutes:
         self._settings = settings
         self._evaluation_client = evaluation_client
 
-    async def start(self, request: Request) -> JSONResponse:
-        """Queue an evaluation, and respond with 202.
+    @Declaration(
+        "POST",
+        "/v1/leagues/{league}/evaluations",
+        Evaluation,
+        scope="evaluate",
+        tag="Evaluation",
+        success="The evaluation was queued.",
+        status=202,
+        headers=(Parameter("location", {"type": "string"}, "The URL of the evaluation."),),
+        body=EvaluationRequest,
+        is_body_optional=True,
+        errors=(
+            UnknownVersion,
+            UnknownAlias,
+            UnknownPolicy,
+            EnvironmentMismatch,
+            TooManyEvaluations,
+            NoEvaluationService,
+        ),
+    )
+    async def evaluate(
+        self, request: Request, league: str, body: EvaluationRequest, key: ApiKey, call: IdempotentCall
+    ) -> Response:
+        """Start an evaluation.
 
-        Raises NoEvaluationService, InvalidInput, Forbidden, InvalidReference, UnknownLeague, UnknownVersion,
-        UnknownAlias, UnknownPolicy, EnvironmentMismatch, TooManyEvaluations or KeyReused.
+        A **tournament** plays `blocks` matches between each pair of contestants, including the scripted baselines. Its
+        games count for ratings; no version is promoted. Aliases are resolved when the evaluation is created.
+
+        A **nightly run** does the same as `league nightly`: it tests new versions, promotes the strongest and updates
+        all ratings. It also requires the scope `promote`. It cannot train exploiters: a verdict that needs new ones
+        (`gate.exploiters`) waits for `league nightly`.
+
+        References are validated immediately. The response is sent before the first game; poll `location` for progress.
         """
-        league = check_slug("league", request.path_params["league"])
-        body = await read_body(request.scope, request.receive, MAX_CHANGE_BODY)
-        evaluation_request = parsing.parse_body(EvaluationRequest, body or b"{}")
-        key, call = parsing.idempotent_call(request, evaluation_request)
-        if isinstance(evaluation_request.root, NightlyRequest) and "promote" not in key.scopes:
+        if isinstance(body.root, NightlyRequest) and "promote" not in key.scopes:
             raise Forbidden(f"a nightly run requires a key with the scope promote; the key {key.name} does not have it")
         evaluation_client = require_client(self._evaluation_client)
 
         def submit(registry: Registry) -> EvaluationRow:
             return registry.evaluations.submit(
                 league,
-                _pinned(evaluation_request, league, registry),
+                _pinned(body, league, registry),
                 actor=key.name,
                 key=key.id,
-                reason=evaluation_request.root.reason,
+                reason=body.root.reason,
                 max_active=self._settings.max_evaluations,
                 max_of_league=self._settings.max_evaluations_per_league,
                 call=call,
@@ -69,40 +128,31 @@ class EvaluationRoutes:
 
         row = await self._models.change(submit, request.scope[DEADLINE])
         evaluation_client.notify()
-        location = f"{self._settings.root_path}{request.url.path}/{row.id}"
-        return JSONResponse(documents.evaluation_document(row), 202, {"location": location})
+        headers = {"location": f"{self._settings.root_path}{request.url.path}/{row.id}"}
+        content = orjson.dumps(Evaluation.model_validate(row).model_dump())
+        return Response(content, 202, headers, media_type="application/json")
 
-    async def page(self, request: Request) -> JSONResponse:
-        """A page of a league's evaluations, without results. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        limit = parsing.query_number(request, "limit", MAX_PAGE) or PAGE
-        before = parsing.query_number(request, "before")
-        rows = await self._models.query(
-            lambda registry: registry.evaluations.newest(league, before=before, limit=limit + 1)
-        )
-        page, more = parsing.paginate(rows, limit, lambda row: row.id)
-        summaries = [documents.evaluation_summary(row) for row in page]
-        return JSONResponse({"league": league, "evaluations": summaries, "next": more})
+    @Declaration(
+        "DELETE",
+        "/v1/leagues/{league}/evaluations/{evaluation}",
+        Evaluation,
+        scope="evaluate",
+        tag="Evaluation",
+        errors=(UnknownEvaluation,),
+    )
+    async def stop_evaluation(self, request: Request, league: str, evaluation: int, key: ApiKey) -> EvaluationRow:
+        """Stop an evaluation.
 
-    async def get(self, request: Request) -> JSONResponse:
-        """One evaluation with its progress and result. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = parsing.evaluation_path(request)
-        return JSONResponse(
-            documents.evaluation_document(
-                await self._models.query(lambda registry: registry.evaluations.get(league, number))
-            )
-        )
-
-    async def stop(self, request: Request) -> JSONResponse:
-        """Request the end of an evaluation; a finished one is unchanged. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = parsing.evaluation_path(request)
-        key: ApiKey = request.scope[KEY]
+        A queued evaluation stops immediately, a running one within seconds. The call has no effect on an evaluation
+        that has ended, so it can be repeated. Completed games stay in the ledger: the same evaluation, started again,
+        continues after them.
+        """
         row = await self._models.change(
-            lambda registry: registry.evaluations.stop(league, number, actor=key.name), request.scope[DEADLINE]
+            lambda registry: registry.evaluations.stop(league, evaluation, actor=key.name), request.scope[DEADLINE]
         )
         if self._evaluation_client is not None:
             self._evaluation_client.notify()
-        return JSONResponse(documents.evaluation_document(row))
+        return row
 
 
 def _pinned(evaluation_request: EvaluationRequest, league: str, registry: Registry) -> dict[str, Any]:

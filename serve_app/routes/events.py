@@ -1,8 +1,5 @@
 """Streams server-sent events: changes of a league or of an evaluation.
 
-    GET  /v1/leagues/{league}/events                            event `league`: change tokens of what can be requested
-    GET  /v1/leagues/{league}/evaluations/{evaluation}/events   event `evaluation`: the evaluation, until it has ended
-
 A stream starts with the current state. Listeners get the newest state, not every intermediate one, so slow readers
 delay nobody. A stream ends when the replica stops, its key becomes invalid, or its state cannot be read any more, as
 that of a removed league; clients reconnect, and get the error. Clients read it with `fetch`, because the `EventSource`
@@ -12,23 +9,24 @@ of browsers cannot send a key.
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
-from typing import Any
+from datetime import datetime
+from typing import Annotated, Any, Literal
 
 import orjson
+from pydantic import BeforeValidator, Field
+from starlette import responses
 from starlette.requests import Request
-from starlette.responses import Response, StreamingResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import DeadlineExceeded, NotFound, NotReady, StorageError, Unauthenticated
-from league.refs import check_slug
+from league.errors import DeadlineExceeded, NotFound, NotReady, StorageError, Unauthenticated, UnknownEvaluation
 from league.registry.registry import Registry
-from league.registry.storage.rows import ChangeToken
 from serve_app.access.access_control import KEY, AccessControl
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.connection_limit import ConnectionLimit
+from serve_app.declaration import EVENT_STREAM, Declaration, Response
 from serve_app.models.polling import Polling
 from serve_app.models.resolver import ModelResolver
-from serve_app.routes import documents, parsing
+from serve_app.routes.documents import Aliases, Evaluation, EvaluationProgress
 from serve_app.runtime.ray_serve import logger
 from serve_app.settings import ServeSettings
 
@@ -171,10 +169,45 @@ def _state(topic: Topic, registry: Registry) -> Document | Exception:
         return error
 
 
-EVENT_STREAM = "text/event-stream"
 HEADERS = {"cache-control": "no-store", "x-accel-buffering": "no"}
 """The second disables buffering in nginx."""
 KEEPALIVE = b": keep-alive\n\n"
+
+
+class RunningEvaluation(Response):
+    """A queued or running evaluation."""
+
+    evaluation: int = Field(validation_alias="id")
+    state: Literal["queued", "running"]
+    progress: EvaluationProgress | None
+
+
+class CurrentRun(Response):
+    """A training run that has not ended."""
+
+    run: str = Field(validation_alias="id")
+    state: Literal["running", "silent"]
+    steps: int
+
+
+class LeagueState(Response):
+    """The data of a `league` event. At least one field differs from the previous event."""
+
+    league: str
+    aliases: Aliases
+    event: int | None = Field(description="The newest change of an alias.")
+    version: int | None = Field(description="The newest version.")
+    note: int | None = Field(description="The newest note of a version.")
+    traffic: int | None = Field(description="The current setting of canary and shadow.")
+    serving: dict[Annotated[str, BeforeValidator(str)], int] = Field(
+        description="Number of replicas by the version that they serve as champion."
+    )
+    verdicts: dict[str, int] = Field(description="Number of verdicts by outcome, or `open`.")
+    evaluation: int | None = Field(description="The newest evaluation.")
+    evaluations: list[RunningEvaluation] = Field(description="Queued and running evaluations.")
+    run: str | None = Field(description="The newest training run.")
+    runs: list[CurrentRun] = Field(description="Training runs that have not ended.")
+    computed_at: datetime | None = Field(description="When the leaderboard, ratings or verdicts were last computed.")
 
 
 class EventRoutes:
@@ -184,21 +217,51 @@ class EventRoutes:
         self._events = events
         self._access = access
 
-    async def league(self, request: Request) -> ASGIApp:
-        """Events of a league. Raises UnknownLeague."""
-        league = check_slug("league", request.path_params["league"])
+    @Declaration(
+        "GET",
+        "/v1/leagues/{league}/events",
+        LeagueState,
+        scope="read",
+        tag="Read",
+        success="A stream of events.",
+        media=EVENT_STREAM,
+    )
+    async def league_events(self, request: Request, league: str) -> ASGIApp:
+        """Follow the changes of a league.
+
+        Server-sent events named `league` whose data is a `LeagueState` in JSON: one immediately, and one after each
+        change. A field that differs from the previous event shows which resources to reload. Rapid changes may be
+        combined into one event.
+
+        A comment is sent every 2 s. The stream ends when the replica stops or the key is no longer valid: open it
+        again. Read it with `fetch`; `EventSource` cannot send an API key.
+        """
 
         def query(registry: Registry) -> Document:
-            return _league_document(registry.changes.token(league))
+            return LeagueState.model_validate(registry.changes.token(league)).model_dump()
 
         return self._stream(request, "league", query, is_last=lambda _: False)
 
-    async def evaluation(self, request: Request) -> ASGIApp:
-        """Events of an evaluation. Raises UnknownLeague or UnknownEvaluation."""
-        league, number = parsing.evaluation_path(request)
+    @Declaration(
+        "GET",
+        "/v1/leagues/{league}/evaluations/{evaluation}/events",
+        Evaluation,
+        scope="read",
+        tag="Evaluation",
+        success="A stream of events.",
+        media=EVENT_STREAM,
+        errors=(UnknownEvaluation,),
+    )
+    async def evaluation_events(self, request: Request, league: str, evaluation: int) -> ASGIApp:
+        """Follow an evaluation.
+
+        Server-sent events named `evaluation` whose data is the response of `GET …/evaluations/{evaluation}`: one
+        immediately, and one after each change. The stream ends with the evaluation, or earlier for the same reasons as
+        the stream of a league.
+        """
 
         def query(registry: Registry) -> Document:
-            return documents.evaluation_document(registry.evaluations.get(league, number))
+            return Evaluation.model_validate(registry.evaluations.get(league, evaluation)).model_dump()
 
         return self._stream(request, "evaluation", query, is_last=lambda document: document["ended_at"] is not None)
 
@@ -206,7 +269,7 @@ class EventRoutes:
         self, request: Request, kind: str, query: Callable[[Registry], Document], is_last: Callable[[Document], bool]
     ) -> ASGIApp:
         if request.method == "HEAD":
-            return Response(headers=HEADERS, media_type=EVENT_STREAM)
+            return responses.Response(headers=HEADERS, media_type=EVENT_STREAM[0])
 
         def encodable(registry: Registry) -> Document:
             """The document, if it is one that can be sent: later, the response has begun."""
@@ -216,7 +279,9 @@ class EventRoutes:
         async def stream(scope: Scope, receive: Receive, send: Send) -> None:
             async with self._events.subscribe(scope["path"], encodable, scope.get(KEY)) as states:
                 messages = _messages(states, kind, is_last, lambda: self._access.check_key(scope.get(KEY)))
-                await StreamingResponse(messages, headers=HEADERS, media_type=EVENT_STREAM)(scope, receive, send)
+                await responses.StreamingResponse(messages, headers=HEADERS, media_type=EVENT_STREAM[0])(
+                    scope, receive, send
+                )
 
         return stream
 
@@ -239,23 +304,3 @@ async def _messages(
         yield b"event: %b\ndata: %b\n\n" % (kind.encode(), orjson.dumps(document))
         if is_last(document):
             return
-
-
-def _league_document(token: ChangeToken) -> Document:
-    return {
-        "league": token.league,
-        "aliases": token.aliases,
-        "event": token.event,
-        "version": token.version,
-        "note": token.note,
-        "traffic": token.traffic,
-        "serving": {str(version): replicas for version, replicas in token.serving.items()},
-        "verdicts": token.verdicts,
-        "evaluation": token.evaluation,
-        "evaluations": [
-            {"evaluation": row.id, "state": row.state, "progress": row.progress} for row in token.evaluations
-        ],
-        "run": token.run,
-        "runs": [{"run": row.id, "state": row.state, "steps": row.steps} for row in token.runs],
-        "computed_at": token.computed_at and token.computed_at.isoformat(),
-    }

@@ -1,10 +1,5 @@
 """Shows recorded games, and plays games of people against policies, with the evaluation service.
 
-    GET   /v1/leagues/{league}/matches/{schedule}/{position}/games/{game}            its steps: ?from=0&to=100&every=1
-    GET   /v1/leagues/{league}/matches/{schedule}/{position}/games/{game}/video.gif
-    GET   /v1/leagues/{league}/playable                                              playable agents and opponents
-    POST  /v1/leagues/{league}/play {"opponent": "connect_four@champion", "agent": "player_0", "actions": [3]}
-
 The server keeps no state of a person's game: each request contains the seed and all actions.
 """
 
@@ -13,28 +8,42 @@ from collections.abc import Callable
 from starlette.requests import Request
 from starlette.responses import Response
 
-from league.errors import UnknownMatch
+from league.errors import (
+    EnvironmentMismatch,
+    GameCrashed,
+    GameHung,
+    IllegalAction,
+    NoEvaluationService,
+    RemoteError,
+    UnknownAlias,
+    UnknownMatch,
+    UnknownPolicy,
+    UnknownVersion,
+    WorkerLost,
+)
 from league.policies.loading import requested
-from league.refs import check_slug
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.service_requests import (
+    MOST_NUMBER,
     GameOperation,
     GameRequest,
     GameResponse,
     HumanPlayRequest,
+    Playability,
     PlayabilityRequest,
     PlayBody,
+    PlayedGame,
+    RecordedGame,
     RecordingRequest,
     VideoRequest,
 )
-from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
+from serve_app.declaration import Declaration, Parameter, integer
 from serve_app.evaluation_client import EvaluationClient, require_client
 from serve_app.models.resolver import ModelResolver
-from serve_app.routes import parsing
 
-DIGITS = 10
-"""Exclusive maximum of digits in the number of a game."""
+GAME_PATH = "/v1/leagues/{league}/matches/{schedule}/{position}/games/{game}"
+OF_GAMES = (NoEvaluationService, GameCrashed, WorkerLost, GameHung)
 
 
 class GameRoutes:
@@ -44,63 +53,130 @@ class GameRoutes:
         self._models = models
         self._evaluation_client = evaluation_client
 
-    async def recording(self, request: Request) -> Response:
-        """Steps of a recorded game. Raises UnknownLeague, UnknownMatch, InvalidInput, and the errors of the evaluation
-        service.
-        """
-        match, game = _named(request)
-        first, end = (parsing.query_number(request, name, smallest=0) for name in ("from", "to"))
-        every = parsing.query_number(request, "every")
-        operation = RecordingRequest(match=match, game=game, first=first or 0, end=end, every=every or 1)
-        return _response(await self._of_match(request, match, game, operation))
+    @Declaration(
+        "GET",
+        GAME_PATH,
+        RecordedGame,
+        parameters=(
+            integer(
+                "from",
+                "The first step. Step 0 is the initial state.",
+                smallest=0,
+                largest=MOST_NUMBER,
+                default=0,
+                argument="first",
+            ),
+            integer("to", "The end of the range (exclusive).", smallest=0, largest=MOST_NUMBER, argument="end"),
+            integer("every", "The distance between two steps.", largest=MOST_NUMBER, default=1),
+        ),
+        errors=(UnknownMatch, *OF_GAMES),
+        scope="read",
+        tag="Games",
+    )
+    async def game(
+        self,
+        _: Request,
+        league: str,
+        schedule: str,
+        position: str,
+        game: int,
+        first: int,
+        end: int | None,
+        every: int,
+    ) -> Response:
+        """Get the steps of a recorded game.
 
-    async def video(self, request: Request) -> Response:
-        """A recorded game as a GIF to download. Raises the errors of `recording`."""
-        match, game = _named(request)
-        video = await self._of_match(request, match, game, VideoRequest(match=match, game=game))
-        name = f"{match.replace('/', '-')}-{game}.gif"
+        The game is replayed from its seed and compared with the record. A response contains at most 100 steps: every
+        `every`-th step from `from` (inclusive) to `to` (exclusive), and the last step of the game if it is in this
+        range.
+        """
+        match = f"{schedule}/{position}"
+        operation = RecordingRequest(match=match, game=game, first=first, end=end, every=every)
+        return _response(await self._of_match(league, operation))
+
+    @Declaration(
+        "GET",
+        f"{GAME_PATH}/video.gif",
+        success="An animated GIF.",
+        media=("image/gif",),
+        headers=(Parameter("content-disposition", {"type": "string"}, "The file name."),),
+        errors=(UnknownMatch, EnvironmentMismatch, *OF_GAMES),
+        scope="read",
+        tag="Games",
+    )
+    async def game_video(self, _: Request, league: str, schedule: str, position: str, game: int) -> Response:
+        """Get a recorded game as an animated GIF.
+
+        At most 500 frames. Each frame shows the actions and their probabilities.
+        """
+        video = await self._of_match(league, VideoRequest(match=f"{schedule}/{position}", game=game))
+        name = f"{schedule}-{position}-{game}.gif".replace("/", "-")
         return _response(video, {"content-disposition": f'attachment; filename="{name}"'})
 
-    async def playability(self, request: Request) -> Response:
-        """Whether and how a league can be played. Raises UnknownLeague and the errors of the evaluation service."""
-        return _response(await self._request_game(request, lambda *_: PlayabilityRequest()))
+    @Declaration(
+        "GET",
+        "/v1/leagues/{league}/playable",
+        Playability,
+        errors=OF_GAMES,
+        scope="read",
+        tag="Games",
+    )
+    async def playable(self, _: Request, league: str) -> Response:
+        """Get the available agents and opponents.
 
-    async def play(self, request: Request) -> Response:
-        """A person's game up to the next choice.
-
-        Raises InvalidInput, InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias, UnknownPolicy,
-        EnvironmentMismatch, IllegalAction, and the errors of the evaluation service.
+        People can play wherever agents choose one of several actions.
         """
-        body = parsing.parse_body(PlayBody, await read_body(request.scope, request.receive, MAX_CHANGE_BODY))
+        return _response(await self._request_game(league, lambda _: PlayabilityRequest()))
 
-        def build_operation(registry: Registry, league: str) -> HumanPlayRequest:
+    @Declaration(
+        "POST",
+        "/v1/leagues/{league}/play",
+        PlayedGame,
+        body=PlayBody,
+        errors=(
+            UnknownVersion,
+            UnknownAlias,
+            UnknownPolicy,
+            EnvironmentMismatch,
+            IllegalAction,
+            RemoteError,
+            *OF_GAMES,
+        ),
+        scope="act",
+        tag="Games",
+    )
+    async def play(self, _: Request, league: str, body: PlayBody) -> Response:
+        """Play against a version.
+
+        Plays the game from its `seed` with your `actions` so far, up to your next turn. The opponent plays all other
+        agents and selects actions as in the league's matches. The server keeps no state: send the seed and all actions
+        with each call. The call can be repeated, and omitting the last actions undoes them.
+
+        An alias is resolved when the call is made. Use the `opponent` of the first response in all following calls.
+        """
+
+        def build_operation(registry: Registry) -> HumanPlayRequest:
             return HumanPlayRequest(**body.model_dump() | {"opponent": requested(body.opponent, league, registry)})
 
-        return _response(await self._request_game(request, build_operation))
+        return _response(await self._request_game(league, build_operation))
 
-    async def _of_match(
-        self, request: Request, match: str, game: int, operation: RecordingRequest | VideoRequest
-    ) -> GameResponse:
-        def check(registry: Registry, league: str) -> RecordingRequest | VideoRequest:
-            record = Ledger(registry).match(match)
-            if record.league != league or game >= len(record.games):
-                raise UnknownMatch(f"league {league} has no game {game} of match {match}")
+    async def _of_match(self, league: str, operation: RecordingRequest | VideoRequest) -> GameResponse:
+        """Send an operation on a recorded game to the evaluation service. Raises UnknownMatch."""
+
+        def check(registry: Registry) -> RecordingRequest | VideoRequest:
+            record = Ledger(registry).match(operation.match)
+            if record.league != league or operation.game >= len(record.games):
+                raise UnknownMatch(f"league {league} has no game {operation.game} of match {operation.match}")
             return operation
 
-        return await self._request_game(request, check)
+        return await self._request_game(league, check)
 
-    async def _request_game(
-        self, request: Request, build_operation: Callable[[Registry, str], GameOperation]
-    ) -> GameResponse:
+    async def _request_game(self, league: str, build_operation: Callable[[Registry], GameOperation]) -> GameResponse:
         """Build an operation with the registry and send it to the evaluation service."""
-        league = check_slug("league", request.path_params["league"])
 
         def build_request(registry: Registry) -> GameRequest:
-            return GameRequest(
-                league=league,
-                conditions=registry.leagues.get(league).conditions.name,
-                operation=build_operation(registry, league),
-            )
+            conditions = registry.leagues.get(league).conditions.name
+            return GameRequest(league=league, conditions=conditions, operation=build_operation(registry))
 
         game_request = await self._models.query(build_request)
         return await require_client(self._evaluation_client).request_game(game_request)
@@ -108,14 +184,3 @@ class GameRoutes:
 
 def _response(game: GameResponse, headers: dict[str, str] | None = None) -> Response:
     return Response(game.content, headers=headers, media_type=game.media_type)
-
-
-def _named(request: Request) -> tuple[str, int]:
-    """The match and the game in a path. Raises UnknownMatch."""
-    schedule, position, game = (
-        parsing.path_name(request, key, UnknownMatch) for key in ("schedule", "position", "game")
-    )
-    match = f"{schedule}/{position}"
-    if not (game.isascii() and game.isdigit() and len(game) < DIGITS):
-        raise UnknownMatch(f"match {match} has no game {game[:32]!r}: expected a number")
-    return match, int(game)

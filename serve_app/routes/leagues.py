@@ -1,100 +1,200 @@
-"""Lists leagues, their versions and what each replica serves; writes notes on versions.
+"""Lists leagues, their versions and what each replica serves; writes notes on versions."""
 
-    GET  /v1/leagues                      by name; a page with ?limit= or &before=
-    GET  /v1/leagues/{league}
-    GET  /v1/leagues/{league}/versions    ascending; with ?limit= or &before= a page, newest first
-    PUT  /v1/leagues/{league}/versions/{version}/note   {"note": "…"}
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from typing import Annotated, Any, Literal
 
-PUT requires an API key of scope `promote`, whose name is stored with the note. It replaces the note; an empty one
-deletes it. PUT is idempotent and needs no `Idempotency-Key`.
-"""
+from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field
 
-from typing import Any
-
-from pydantic import BaseModel, ConfigDict, Field
-from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
-
+from league.conditions import ActionSelection
+from league.errors import UnknownAlias, UnknownVersion
 from league.policies.loading import baselines
-from league.refs import CHAMPION, CheckpointRef, check_slug, parse_version
+from league.refs import CHAMPION, CheckpointRef, parse_version
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY
-from league.registry.storage.rows import Acknowledgement, VersionRow
+from league.registry.storage.rows import Note, VersionRow
 from league.registry.versions import MAX_NOTE_LENGTH
-from serve_app.access.access_control import DEADLINE, KEY
+from league.results.records import Scoring
 from serve_app.access.api_keys import ApiKey
-from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
-from serve_app.models.resolver import ModelResolver
+from serve_app.declaration import Declaration, Page, Response
 from serve_app.observability.metrics_reporter import RequestCounts, request_counts
-from serve_app.routes import documents, parsing
+from serve_app.routes import documents
+from serve_app.routes.documents import (
+    Aliases,
+    ComputedAt,
+    MixtureMember,
+    Number,
+    Selection,
+    StoredDocument,
+    StoredTime,
+    TrafficSetting,
+    VerdictDecision,
+)
+
+NO_REQUESTS = RequestCounts()
+Members = Annotated[list[MixtureMember], Field(description="Versions of a mixture, with probabilities that sum to 1.")]
+Digest = Annotated[
+    str,
+    Field(
+        pattern="^[0-9a-f]{64}$",
+        description="SHA-256 of the manifest.json of the version, which contains the digests of all its files.",
+    ),
+]
+
+
+class Activity(Response):
+    """The requests for the versions of a league."""
+
+    requests: int = Field(description="Number of requests to the current replicas since they started.")
+    requests_per_second: float = Field(description="Rate of all replicas over the last seconds.")
+
+
+class ListedLeague(Activity):
+    """A league with its champion and its current activity."""
+
+    league: str
+    champion: int | None
+    aliases: Aliases
+    versions: int = Field(description="Number of versions.")
+    games: int | None = Field(description="Number of counted games at the last computation of the leaderboard.")
+    matches: int | None
+    last_verdict: VerdictDecision | None
+    running_evaluations: int = Field(description="Number of evaluations, including queued ones.")
+    running_runs: int = Field(description="Number of running training runs.")
+    archived_at: datetime | None = Field(description="Since when the league is archived; null if it is not.")
+
+
+class Space(StoredDocument):
+    """The definition of a space."""
+
+    type: Literal["box", "discrete", "multi_discrete", "multi_binary", "dict"]
+
+
+class PolicySpaces(StoredDocument):
+    """The spaces of a policy."""
+
+    observation: Space
+    action: Space
+
+
+def _seconds(silence: timedelta) -> float:
+    return max(0.0, silence.total_seconds())
+
+
+class ServingReplica(Response):
+    """What a replica serves of a league. It is listed until it deregisters or its process has ended."""
+
+    replica: str
+    version: int | None
+    sha256: str | None
+    aliases: Aliases
+    fault: str | None
+    event: int | None = Field(
+        description="Id of the newest event of the league's aliases that it has read; null if it has not reported on"
+        " the league."
+    )
+    seen_at: datetime = Field(description="Time of its last report, by the clock of the database.")
+    silent_seconds: Annotated[float, BeforeValidator(_seconds)] = Field(
+        ge=0, validation_alias="silence", description="Time since its last report, by the clock of the database."
+    )
+
+
+class Change(Response):
+    """A part of a game that differs now."""
+
+    name: str
+    before: str | None
+    now: str | None
+
+
+class EarlierGame(Response):
+    """Results from before the game of the league, or the selection of actions, changed."""
+
+    name: str = Field(description="Value of `game` for the leaderboard and the payoff matrix.")
+    actions: ActionSelection
+    matches: int
+    changes: list[Change] = Field(description="What of the game differs now; digests are abbreviated.")
+    actions_changed: bool
+    replaced_at: StoredTime | None
+
+
+class Summary(StoredDocument):
+    """Counted games: those of the current game of the league, with its current sides and action selection."""
+
+    games: int
+    matches: int
+    unique_games: int
+    scoring: Scoring
+    actions: ActionSelection
+    sides: list[str]
+    environment: str
+    environment_digest: str
+    earlier: list[EarlierGame] = Field(description="Newest first. They do not count.")
+
+
+class League(Activity):
+    """A league."""
+
+    league: str
+    environment: str
+    actions: Selection
+    champion: int | None
+    aliases: Aliases
+    mixtures: dict[str, Members] = Field(
+        description="The members of the mixtures among the versions that aliases point to, by alias."
+    )
+    policies: dict[str, PolicySpaces]
+    agents: dict[str, str] = Field(description="Policy by agent.")
+    sides: dict[str, list[str]] = Field(description="Agents by side. With one side, all agents are a team.")
+    baselines: list[str] = Field(
+        description="Contestants besides the versions: scripts that can play the league, and the bots and remote models"
+        " that its configuration names."
+    )
+    replicas: list[ServingReplica]
+    faults: list[str]
+    traffic: TrafficSetting
+    summary: Summary | None
+    computed_at: ComputedAt
+    up_to_date: bool = Field(description="Whether leaderboard, payoffs and ratings include all games.")
+
+
+class ListedVersion(Response):
+    """A version."""
+
+    version: Number = Field(validation_alias="number")
+    aliases: list[str]
+    sha256: Digest
+    parent: int | None
+    role: Literal["main", "exploiter", "mixture"] = Field(
+        description="An exploiter cannot become champion. A mixture has members, one of which plays each episode."
+    )
+    exploits: str | None = Field(description="The version that an exploiter was trained against.")
+    members: Members | None = Field(default=None, validation_alias=AliasPath("mixture", "members"))
+    steps: int = Field(description="Number of environment steps of training.")
+    algorithm: str = Field(validation_alias=AliasPath("manifest", "algorithm"))
+    policies: Annotated[list[str], BeforeValidator(list)] = Field(validation_alias=AliasPath("manifest", "policies"))
+    created_at: datetime
+    retired_at: datetime | None = Field(description="When its files were removed.")
+    note: Note | None
 
 
 class NoteBody(BaseModel):
-    """The body of a note."""
+    """A note."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
     note: str = Field(max_length=MAX_NOTE_LENGTH, pattern=r"^[^\x00]*$")
 
 
-NO_REQUESTS = RequestCounts()
+@Declaration("GET", "/v1/leagues", Page("leagues", ListedLeague, "league", is_whole=True), scope="read", tag="Read")
+def leagues(registry: Registry, limit: int | None, before: str | None) -> Sequence[dict[str, Any]]:
+    """List leagues.
 
-
-class LeagueRoutes:
-    """The endpoints. Access control requires the scope `promote` for PUT."""
-
-    def __init__(self, models: ModelResolver) -> None:
-        self._models = models
-
-    async def page(self, request: Request) -> Response:
-        """Leagues with their champions and current activity. Raises InvalidInput."""
-        limit = parsing.page_size(request) if _is_paged(request) else None
-        before = parsing.query_name(request, "before")
-        return await parsing.query_response(self._models, lambda registry: _leagues(registry, before, limit))
-
-    async def get(self, request: Request) -> Response:
-        """A league: aliases, policies, and what each replica serves. Raises UnknownLeague."""
-        league = check_slug("league", request.path_params["league"])
-        return await parsing.query_response(self._models, lambda registry: _league(registry, league))
-
-    async def versions(self, request: Request) -> Response:
-        """The versions of a league. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        if not _is_paged(request):
-            return await parsing.query_response(self._models, lambda registry: _all_versions(registry, league))
-        limit, before = parsing.page_size(request), parsing.query_number(request, "before")
-
-        def query(registry: Registry) -> dict[str, Any]:
-            rows = registry.versions.newest(league, before=before, limit=limit + 1)
-            page, more = parsing.paginate(rows, limit, lambda row: row.number)
-            return {"league": league, "versions": list(map(version_document, page)), "next": more}
-
-        return await parsing.query_response(self._models, query)
-
-    async def put_note(self, request: Request) -> JSONResponse:
-        """Set the note of a version. Raises InvalidReference, UnknownLeague, UnknownVersion, UnknownAlias or
-        InvalidInput.
-        """
-        league = check_slug("league", request.path_params["league"])
-        ref = CheckpointRef(league, parse_version(request.path_params["version"]))
-        body = parsing.parse_body(NoteBody, await read_body(request.scope, request.receive, MAX_CHANGE_BODY))
-        key: ApiKey = request.scope[KEY]
-        row = await self._models.change(
-            lambda registry: registry.versions.set_note(ref, body.note, actor=key.name), request.scope[DEADLINE]
-        )
-        return JSONResponse(version_document(row))
-
-
-def _is_paged(request: Request) -> bool:
-    return not {"limit", "before"}.isdisjoint(request.query_params.keys())
-
-
-def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[str, Any]:
-    """At most `limit` leagues by name, after the cursor."""
+    Ordered by name. Without `limit` and `before` all leagues are returned.
+    """
     archived = registry.leagues.names()
-    names = sorted(name for name in archived if before is None or name > before)
-    page, more = parsing.paginate(names, len(names) if limit is None else limit, lambda name: name)
-    aliases: dict[str, dict[str, int]] = {league: {} for league in page}
+    names = sorted(name for name in archived if before is None or name > before)[:limit]
+    aliases: dict[str, dict[str, int]] = {league: {} for league in names}
     for (league, alias), target in registry.aliases.all().items():
         if league in aliases:
             aliases[league][alias] = target.version
@@ -103,25 +203,31 @@ def _leagues(registry: Registry, before: str | None, limit: int | None) -> dict[
     evaluations, runs = registry.evaluations.counts(), registry.runs.counts()
     counts = request_counts(registry.replicas.reports().values())
 
-    def document(league: str, found: dict[str, int]) -> dict[str, Any]:
+    def document(league: str) -> dict[str, Any]:
         summary = summaries[league].document if league in summaries else {}
         return {
             "league": league,
-            "champion": found.get(CHAMPION),
-            "aliases": found,
+            "champion": aliases[league].get(CHAMPION),
+            "aliases": aliases[league],
             "versions": len(versions.get(league, ())),
             "games": summary.get("games"),
             "matches": summary.get("matches"),
-            "last_verdict": documents.verdict_summary(verdicts[league]) if league in verdicts else None,
+            "last_verdict": documents.decision(verdicts[league]) if league in verdicts else None,
             "running_evaluations": sum(evaluations.get(league, {}).values()),
             "running_runs": runs.get(league, 0),
-            "archived_at": (at := archived[league]) and at.isoformat(),
-        } | _requests(counts.get(league, NO_REQUESTS))
+            "archived_at": archived[league],
+        } | _activity(counts.get(league, NO_REQUESTS))
 
-    return {"leagues": [document(league, league_aliases) for league, league_aliases in aliases.items()], "next": more}
+    return list(map(document, names))
 
 
-def _league(registry: Registry, league: str) -> dict[str, Any]:
+@Declaration("GET", "/v1/leagues/{league}", League, scope="read", tag="Read")
+def league(registry: Registry, league: str) -> dict[str, Any]:
+    """Get a league.
+
+    The aliases, the policies with their spaces, the version that each replica serves, and `faults`: the reasons why a
+    replica does not serve the expected version.
+    """
     row = registry.leagues.get(league)
     aliases = registry.aliases.current(league)
     mixtures = registry.versions.mixtures(league, set(aliases.values()))
@@ -135,59 +241,54 @@ def _league(registry: Registry, league: str) -> dict[str, Any]:
         "actions": row.conditions.actions,
         "champion": aliases.get(CHAMPION),
         "aliases": aliases,
-        "mixtures": {
-            alias: documents.members_document(mixtures[number])
-            for alias, number in aliases.items()
-            if number in mixtures
-        },
+        "mixtures": {alias: mixtures[number].members for alias, number in aliases.items() if number in mixtures},
         "policies": {policy: interface.of_policy(policy).model_dump(mode="json") for policy in interface.policy_ids},
         "agents": interface.policies,
         "sides": interface.sides,
         "baselines": baselines(row.config, interface),
-        "replicas": list(map(_replica, acknowledgements)),
+        "replicas": acknowledgements,
         "faults": sorted({acknowledgement.fault for acknowledgement in acknowledgements if acknowledgement.fault}),
-        "traffic": documents.traffic_document(registry.traffic.current(league)),
+        "traffic": registry.traffic.current(league),
         "summary": summary and summary.document,
-        "computed_at": summary and summary.at.isoformat(),
+        "computed_at": summary and summary.at,
         "up_to_date": summary is not None and summary.mark == registry.snapshots.current_marks()[league],
-    } | _requests(counts.get(league, NO_REQUESTS))
+    } | _activity(counts.get(league, NO_REQUESTS))
 
 
-def _requests(counts: RequestCounts) -> dict[str, Any]:
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/versions",
+    Page("versions", ListedVersion, "version", is_whole=True),
+    scope="read",
+    tag="Read",
+)
+def versions(registry: Registry, league: str, limit: int | None, before: int | None) -> Sequence[VersionRow]:
+    """List versions.
+
+    Without `limit` and `before` all versions in ascending order; otherwise a page, newest first.
+    """
+    if limit is None:
+        return registry.versions.all(league)
+    return registry.versions.newest(league, before=before, limit=limit)
+
+
+@Declaration(
+    "PUT",
+    "/v1/leagues/{league}/versions/{version}/note",
+    ListedVersion,
+    scope="promote",
+    tag="Management",
+    body=NoteBody,
+    errors=(UnknownVersion, UnknownAlias),
+)
+def note(registry: Registry, league: str, version: str, body: NoteBody, key: ApiKey) -> VersionRow:
+    """Set the note of a version.
+
+    Replaces the previous note; an empty note deletes it. The name of the key is stored with the note. The call can be
+    repeated, and needs no `Idempotency-Key`.
+    """
+    return registry.versions.set_note(CheckpointRef(league, parse_version(version)), body.note, actor=key.name)
+
+
+def _activity(counts: RequestCounts) -> dict[str, Any]:
     return {"requests": counts.count, "requests_per_second": counts.rate}
-
-
-def _replica(acknowledgement: Acknowledgement) -> dict[str, Any]:
-    return {
-        "replica": acknowledgement.replica,
-        "version": acknowledgement.version,
-        "sha256": acknowledgement.sha256,
-        "aliases": acknowledgement.aliases,
-        "fault": acknowledgement.fault,
-        "event": acknowledgement.event,
-        "seen_at": acknowledgement.seen_at.isoformat(),
-        "silent_seconds": max(0.0, acknowledgement.silence.total_seconds()),
-    }
-
-
-def _all_versions(registry: Registry, league: str) -> dict[str, Any]:
-    return {"league": league, "versions": list(map(version_document, registry.versions.all(league))), "next": None}
-
-
-def version_document(row: VersionRow) -> dict[str, Any]:
-    """A version as JSON."""
-    return {
-        "version": row.number,
-        "aliases": list(row.aliases),
-        "sha256": row.sha256,
-        "parent": row.parent,
-        "role": row.role,
-        "exploits": row.exploits,
-        "members": row.mixture and documents.members_document(row.mixture),
-        "steps": row.steps,
-        "algorithm": row.manifest.algorithm,
-        "policies": list(row.manifest.policies),
-        "created_at": row.created_at.isoformat(),
-        "retired_at": row.retired_at and row.retired_at.isoformat(),
-        "note": row.note and {"text": row.note.text, "actor": row.note.actor, "at": row.note.at.isoformat()},
-    }

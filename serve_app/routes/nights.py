@@ -1,103 +1,158 @@
-"""Lists nights of training and nightly runs: the champion after each, how exploitable it is, and the verdicts.
+"""Lists nights of training and nightly runs: the champion after each, how exploitable it is, and the verdicts."""
 
-GET  /v1/leagues/{league}/nights         nights of training, newest first; ?limit= &before=
-GET  /v1/leagues/{league}/nightly-runs   nightly runs, newest first; ?limit= &before=
-"""
-
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from datetime import datetime
 from typing import Any
 
-from starlette.requests import Request
-from starlette.responses import Response
+from pydantic import Field
 
-from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.storage.rows import NightlyRunRow, TrainingNightRow
-from serve_app.models.resolver import ModelResolver
-from serve_app.routes import parsing
+from serve_app.declaration import Declaration, Page, Response
+from serve_app.routes.documents import Interval
 
 RATINGS = "ratings"
 """The snapshot with the ratings of all versions."""
 
 
-class NightRoutes:
-    """The endpoints."""
+class Gain(Response):
+    """Mean return of the exploiter minus that of the champion, with a 95 % interval."""
 
-    def __init__(self, models: ModelResolver) -> None:
-        self._models = models
-
-    async def page(self, request: Request) -> Response:
-        """A page of a league's nights of training. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        limit, before = parsing.page_size(request), parsing.query_number(request, "before")
-
-        def query(registry: Registry) -> dict[str, Any]:
-            rows = [row for row in reversed(registry.training_nights.all(league)) if before is None or row.id < before]
-            page, more = parsing.paginate(rows[: limit + 1], limit, lambda row: row.id)
-            snapshot = registry.snapshots.get(league, RATINGS)
-            ratings = {} if snapshot is None else {rating["ref"]: rating for rating in snapshot.document["versions"]}
-            return {"league": league, "nights": [_night(row, ratings) for row in page], "next": more}
-
-        return await parsing.query_response(self._models, query)
-
-    async def nightly_runs(self, request: Request) -> Response:
-        """A page of a league's nightly runs. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        limit, before = parsing.page_size(request), parsing.query_number(request, "before")
-
-        def query(registry: Registry) -> dict[str, Any]:
-            rows = [row for row in reversed(registry.nightly_runs.all(league)) if before is None or row.id < before]
-            page, more = parsing.paginate(rows[: limit + 1], limit, lambda row: row.id)
-            return {"league": league, "nightly_runs": list(map(_nightly_run, page)), "next": more}
-
-        return await parsing.query_response(self._models, query)
+    mean: float
+    low: float | None
+    high: float | None
 
 
-def _nightly_run(row: NightlyRunRow) -> dict[str, Any]:
-    """A nightly run as JSON. What it decided is null or empty while it runs."""
+class ChampionExploitability(Response):
+    """The score of the best exploiter against the champion."""
+
+    bound: float = Field(description="A best response scores at least this.")
+    exploiter: str
+    games: int
+    score: float
+    low: float
+    high: float
+    gain: Gain | None
+
+
+class Night(Response):
+    """A night of training. Results of steps that are not complete yet are null or empty."""
+
+    night: int = Field(description="Its id, unique among all leagues.")
+    number: int = Field(description="Its place among the nights of the league, from 1.")
+    run: str = Field(description="Its training run.")
+    exploiter_run: str | None = Field(description="The training run of the champion's exploiter.")
+    parent: int | None = Field(
+        description="The version that training started from, null: from scratch. Until training is complete, the"
+        " champion when the night began, or the newest version."
+    )
+    versions: list[str] = Field(description="The versions that were trained.")
+    champion_before: str | None
+    champion: str | None = Field(description="The champion after the gate.")
+    rating: float | None = Field(description="The champion's rating now, in Elo above `script:random`.")
+    interval: Interval
+    exploitability: ChampionExploitability | None
+    errors: list[str]
+    began_at: datetime
+    ended_at: datetime | None
+
+
+class NightlyVerdict(Response):
+    """A verdict of a nightly run."""
+
+    verdict: str
+    candidate: str
+    opponent: str
+    outcome: str
+    promoted: bool = Field(description="Whether the candidate became champion.")
+
+
+class NightlyRun(Response):
+    """A nightly run. What it decided is null or empty while it runs."""
+
+    nightly_run: int = Field(description="Its id, unique among all leagues.")
+    candidates: list[str] = Field(description="The versions that it tests.")
+    alpha: float = Field(description="Error probability of each verdict.")
+    verdicts: list[NightlyVerdict] = Field(description="Empty while it runs.")
+    champion_before: str | None
+    champion: str | None = Field(description="The champion after the run.")
+    errors: list[str] = Field(description="Versions that could not be tested or rated.")
+    began_at: datetime
+    ended_at: datetime | None
+
+
+@Declaration("GET", "/v1/leagues/{league}/nights", Page("nights", Night, "night"), scope="read", tag="Results")
+def nights(registry: Registry, league: str, limit: int, before: int | None) -> Sequence[Night]:
+    """List nights of training.
+
+    The nights of `league nightly --train`, newest first.
+    """
+    rows = [row for row in reversed(registry.training_nights.all(league)) if before is None or row.id < before]
+    snapshot = registry.snapshots.get(league, RATINGS)
+    ratings = {} if snapshot is None else {rating["ref"]: rating for rating in snapshot.document["versions"]}
+    return [_night(row, ratings) for row in rows[:limit]]
+
+
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/nightly-runs",
+    Page("nightly_runs", NightlyRun, "nightly_run"),
+    scope="read",
+    tag="Results",
+)
+def nightly_runs(registry: Registry, league: str, limit: int, before: int | None) -> Sequence[NightlyRun]:
+    """List nightly runs.
+
+    The runs of `league nightly`, alone or in a night of training, newest first.
+    """
+    rows = [row for row in reversed(registry.nightly_runs.all(league)) if before is None or row.id < before]
+    return [_nightly_run(row) for row in rows[:limit]]
+
+
+def _nightly_run(row: NightlyRunRow) -> NightlyRun:
     report = row.report or {}
-    fields = ("verdict", "candidate", "opponent", "outcome", "promoted")
-    return {
-        "nightly_run": row.id,
-        "candidates": [f"{row.league}@{number}" for number in row.candidates],
-        "alpha": row.alpha,
-        "verdicts": [{name: verdict[name] for name in fields} for verdict in report.get("verdicts", ())],
-        "champion_before": report.get("champion_before"),
-        "champion": report.get("champion"),
-        "errors": report.get("faults", []),
-        "began_at": row.began_at.isoformat(),
-        "ended_at": row.ended_at and row.ended_at.isoformat(),
-    }
+    return NightlyRun(
+        nightly_run=row.id,
+        candidates=[f"{row.league}@{number}" for number in row.candidates],
+        alpha=row.alpha,
+        verdicts=[
+            NightlyVerdict(**{name: verdict[name] for name in NightlyVerdict.model_fields})
+            for verdict in report.get("verdicts", ())
+        ],
+        champion_before=report.get("champion_before"),
+        champion=report.get("champion"),
+        errors=report.get("faults", []),
+        began_at=row.began_at,
+        ended_at=row.ended_at,
+    )
 
 
-def _night(row: TrainingNightRow, ratings: Mapping[str, Any]) -> dict[str, Any]:
-    """A night as JSON. Results of steps that are not complete yet are null or empty."""
+def _night(row: TrainingNightRow, ratings: Mapping[str, Any]) -> Night:
     train, gate, measured = (row.steps.get(step, {}) for step in ("train", "gate", "measure"))
     champion = gate.get("champion")
     rated = ratings.get(champion, {})
-    return {
-        "night": row.id,
-        "number": row.number,
-        "run": row.run,
-        "exploiter_run": row.steps.get("exploiter", {}).get("run"),
-        "parent": row.start,
-        "versions": train.get("versions", []),
-        "champion_before": gate.get("champion_before"),
-        "champion": champion,
-        "rating": rated.get("rating"),
-        "interval": rated.get("interval"),
-        "exploitability": _exploitability(measured.get("exploitability")),
-        "errors": [f"{step}: {result['error']}" for step, result in row.steps.items() if "error" in result],
-        "began_at": row.began_at.isoformat(),
-        "ended_at": row.ended_at and row.ended_at.isoformat(),
-    }
+    return Night(
+        night=row.id,
+        number=row.number,
+        run=row.run,
+        exploiter_run=row.steps.get("exploiter", {}).get("run"),
+        parent=row.start,
+        versions=train.get("versions", []),
+        champion_before=gate.get("champion_before"),
+        champion=champion,
+        rating=rated.get("rating"),
+        interval=rated.get("interval"),
+        exploitability=_exploitability(measured.get("exploitability")),
+        errors=[f"{step}: {result['error']}" for step, result in row.steps.items() if "error" in result],
+        began_at=row.began_at,
+        ended_at=row.ended_at,
+    )
 
 
-def _exploitability(measured: Mapping[str, Any] | None) -> dict[str, Any] | None:
+def _exploitability(measured: Mapping[str, Any] | None) -> ChampionExploitability | None:
     """The score of the best exploiter against the champion, and the lower bound of a best response's score."""
     if measured is None:
         return None
     best = measured["exploiters"][0]
-    return {"bound": measured["bound"], "exploiter": best["ref"]} | {
-        name: best[name] for name in ("games", "score", "low", "high", "gain")
-    }
+    scores = {name: best[name] for name in ("games", "score", "low", "high", "gain")}
+    return ChampionExploitability(bound=measured["bound"], exploiter=best["ref"], **scores)

@@ -1,9 +1,5 @@
 """Serves the web pages, the OpenAPI document and its page.
 
-    GET /docs, /openapi.json
-    GET /, /leagues, /leagues/…    the document; its script selects the page from the address
-    GET /pages/{file}              scripts, styles and images
-
 None of them requires a key. The OpenAPI document contains examples of policies only if the presented key may read all
 leagues. Pages load nothing from other origins, run only their own scripts, and cannot be framed. Browsers revalidate
 their copies by ETag. All references are relative, so that the pages work below any prefix that a proxy adds to paths.
@@ -15,55 +11,65 @@ import asyncio
 import gzip
 import re
 from base64 import b64encode
+from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import orjson
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
-from starlette.routing import Route
 
 import serve_app
-from serve_app import openapi
 from serve_app.access.access_control import AccessControl
+from serve_app.declaration import Declaration
 from serve_app.models.alias_slots import AliasSlots
 from serve_app.models.version_cache import LoadedVersion
-from serve_app.openapi.document import document
-from serve_app.settings import ServeSettings
 
-PAGE = Path(openapi.__file__).with_name("page.html")
+PAGE = Path(serve_app.__file__).parent / "openapi" / "page.html"
 FRESH = {"cache-control": "no-cache", "vary": "authorization, x-api-key"}
 
 
 class DocsRoutes:
-    """The OpenAPI document and its page."""
+    """The OpenAPI document and its page. document: returns it with examples for the served versions."""
 
-    def __init__(self, slots: AliasSlots, access: AccessControl, settings: ServeSettings) -> None:
+    def __init__(
+        self, slots: AliasSlots, access: AccessControl, document: Callable[[list[LoadedVersion]], dict[str, Any]]
+    ) -> None:
         self._slots = slots
         self._access = access
-        self._settings = settings
+        self._document = document
         self._page = PAGE.read_bytes()
         self._rules = {"content-security-policy": _content_security_policy(self._page), "cache-control": "no-cache"}
         self._described: dict[tuple[str, ...], bytes] = {}
         """Digests of the served versions → the document: the latest, and the one without examples."""
 
+    @Declaration("GET", "/openapi.json", "OpenApi", scope=None, tag="Server", success="An OpenAPI 3.1 document.")
     async def openapi(self, request: Request) -> Response:
-        """An OpenAPI 3.1 document."""
+        """Get this description.
+
+        If no key is required, or with a key that has the scope `read` for all leagues, it includes examples for all
+        served policies.
+        """
         served: list[LoadedVersion] = []
         if self._access.may_read_all(request.scope["headers"]):
             champions = (self._slots.champion(league) for league in self._slots.leagues())
             served = [version for version in champions if version is not None]
         digests = tuple(version.sha256 for version in served)
         if (body := self._described.get(digests)) is None:
-            body = await asyncio.to_thread(lambda: orjson.dumps(document(self._settings, served)))
+            body = await asyncio.to_thread(lambda: orjson.dumps(self._document(served)))
             without = {key: kept for key, kept in self._described.items() if not key}
             self._described = without | {digests: body}
         return Response(body, media_type="application/json", headers=FRESH)
 
+    @Declaration("GET", "/docs", scope=None, tag="Server", success="A self-contained HTML page.", media=("text/html",))
     async def docs(self, _: Request) -> Response:
-        """A page that shows the document and sends requests to this server."""
+        """Get this description as a web page.
+
+        The page also sends requests to this server.
+        """
         return Response(self._page, media_type="text/html", headers=self._rules)
 
 
@@ -135,22 +141,20 @@ class PageRoutes:
         self._files = {path.relative_to(FILES).as_posix(): StaticFile.of(path, path.read_bytes()) for path in paths}
         self._documents = [StaticFile.of(FILES / DOCUMENT, _document(depth)) for depth in range(MAX_DEPTH + 1)]
 
-    def routes(self) -> list[Route]:
-        """The routes, which are not part of the API."""
-        document = [(path, self.document) for path in ("/", "/leagues", "/leagues/{page:path}")]
-        places = [*document, ("/pages/{file:path}", self.file)]
-        return [Route(path, endpoint, include_in_schema=False) for path, endpoint in places]
-
-    async def document(self, request: Request) -> Response:
+    @Declaration("GET", "/", scope=None, tag=None)
+    @Declaration("GET", "/leagues", scope=None, tag=None)
+    @Declaration("GET", "/leagues/{page:path}", scope=None, tag=None)
+    async def document(self, request: Request, page: str = "") -> Response:  # noqa: ARG002
         """The HTML document, which differs by the depth of the path only: its script renders what the address names."""
         depth = request.scope["raw_path"].count(b"/") - 1  # as the browser counts: an encoded slash does not separate
         if depth > MAX_DEPTH:
             raise HTTPException(404)
         return self._documents[depth].response(request)
 
-    async def file(self, request: Request) -> Response:
+    @Declaration("GET", "/pages/{file:path}", scope=None, tag=None)
+    async def file(self, request: Request, file: str) -> Response:
         """A static file."""
-        static_file = self._files.get(request.path_params["file"])
+        static_file = self._files.get(file)
         if static_file is None:
             raise HTTPException(404)
         return static_file.response(request)

@@ -1,160 +1,213 @@
 """Lists results of a league: matches from the ledger, the leaderboard, the payoff matrix and the rating history.
 
-    GET  /v1/leagues/{league}/matches                          newest first; ?limit= &before=
-                                                               ?first= &second=: only those between these two
-    GET  /v1/leagues/{league}/matches/{schedule}/{position}    with its games
-    GET  /v1/leagues/{league}/leaderboard    ?side= &limit= &offset= &game=
-    GET  /v1/leagues/{league}/payoff         ?game=
-    GET  /v1/leagues/{league}/ratings
-
 `game` names earlier conditions (`summary.earlier` of the league): results from before the game of the league, or the
 selection of actions, changed. `computed_at` is the time of the last update, null before the first.
 """
 
+from collections.abc import Sequence
+from datetime import datetime
 from typing import Any
 
-from starlette.requests import Request
-from starlette.responses import Response
+from pydantic import Field
 
 from league.conditions import Conditions
 from league.errors import InvalidInput, UnknownMatch
-from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY, earlier_part
+from league.results import records
 from league.results.ledger import Ledger
-from league.results.records import Game, LedgerEntry, Match, Schedule
-from serve_app.models.resolver import ModelResolver
-from serve_app.routes import parsing
+from league.service_requests import GameForfeit
+from serve_app.declaration import Declaration, Page, Response, integer, text
+from serve_app.routes.documents import ComputedAt, Interval, Number, StoredDocument, StoredTime
+
+GAME = text(
+    "game",
+    "`name` of one of `earlier` in the summary of the league: the results of an earlier game.",
+    "4f2a91c0b7de-greedy",
+)
 
 
-class ResultRoutes:
-    """The endpoints."""
+class MatchSummary(Response):
+    """A match: two games in which the contestants swap sides."""
 
-    def __init__(self, models: ModelResolver) -> None:
-        self._models = models
-
-    async def matches(self, request: Request) -> Response:
-        """A page of a league's matches. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        limit, before = parsing.page_size(request), parsing.query_name(request, "before")
-        pair = _pair(request)
-
-        def query(registry: Registry) -> dict[str, Any]:
-            rows = Ledger(registry).page(league, contestants=pair, before=before, limit=limit + 1)
-            page, more = parsing.paginate(rows, limit, lambda row: row.id)
-            current = registry.leagues.get(league).conditions
-            return {"league": league, "matches": [_listed(entry, current) for entry in page], "next": more}
-
-        return await parsing.query_response(self._models, query)
-
-    async def match(self, request: Request) -> Response:
-        """A match with its games. Raises UnknownLeague or UnknownMatch."""
-        league = check_slug("league", request.path_params["league"])
-        schedule, position = (parsing.path_name(request, key, UnknownMatch) for key in ("schedule", "position"))
-        return await parsing.query_response(
-            self._models, lambda registry: _one(registry, league, f"{schedule}/{position}")
-        )
-
-    async def leaderboard(self, request: Request) -> Response:
-        """A page of the leaderboard, over all games or one side. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        side, limit = parsing.query_name(request, "side"), parsing.page_size(request)
-        offset = parsing.query_number(request, "offset", smallest=0) or 0
-        game = parsing.query_name(request, "game")
-        return await parsing.query_response(
-            self._models, lambda registry: _leaderboard(registry, league, game, side, offset, limit)
-        )
-
-    async def payoff(self, request: Request) -> Response:
-        """The payoff matrix of the best contestants. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        game = parsing.query_name(request, "game")
-
-        def query(registry: Registry) -> dict[str, Any]:
-            document, computed_at = _snapshot(registry, league, _part(registry, league, game, "payoff"))
-            return {"league": league, "computed_at": computed_at, "payoff": document}
-
-        return await parsing.query_response(self._models, query)
-
-    async def ratings(self, request: Request) -> Response:
-        """The versions, oldest first, with their ratings and promotions. Raises UnknownLeague."""
-        league = check_slug("league", request.path_params["league"])
-
-        def query(registry: Registry) -> dict[str, Any]:
-            document, computed_at = _snapshot(registry, league, "ratings")
-            return {"league": league, "computed_at": computed_at} | (document or {"versions": []})
-
-        return await parsing.query_response(self._models, query)
+    match: str = Field(description="`schedule/position`")
+    schedule: str
+    position: int
+    kind: str = Field(description="The kind of the schedule: `verdict`, `gauntlet`, `round_robin` …")
+    contestants: tuple[str, str]
+    scores: list[float] = Field(description="Sums over the games.")
+    returns: list[float] | None = Field(description="Sums over the games; null if a game was forfeited.")
+    counts: bool = Field(
+        description="Whether the match is counted. False if its schedule was purged, or if it was another game: the"
+        " environment, its code, or settings of play that decide results have changed since."
+    )
+    played_at: datetime
 
 
-def _pair(request: Request) -> tuple[str, str] | None:
-    first, second = parsing.query_name(request, "first"), parsing.query_name(request, "second")
-    if first is None and second is None:
-        return None
-    if first is None or second is None:
+class ListedMatch(MatchSummary):
+    """A match without its games."""
+
+    games: int = Field(description="Number of games of each contestant.")
+
+
+class MatchGame(Response):
+    """A game of a match."""
+
+    game: int
+    sides: dict[str, str] = Field(description="Contestant by side.")
+    members: dict[str, str] = Field(description="Version that played, by contestant that is a mixture.")
+    scores: list[float | None] = Field(
+        description="Score of each contestant; null if it did not take part, or if both were in one team."
+    )
+    returns: list[float | None]
+    opening: int = Field(description="Number of opening actions.")
+    actions: int = Field(description="Number of actions after the opening.")
+    forfeits: list[GameForfeit]
+
+
+class MatchWithGames(MatchSummary):
+    """A match with its games."""
+
+    league: str
+    seed: int
+    games: list[MatchGame]
+
+
+class LeaderboardRow(StoredDocument):
+    """A row of the leaderboard."""
+
+    rank: int = Field(ge=1)
+    ref: str
+    rating: float | None = Field(description="Elo above `script:random`; null if no chain of games connects the two.")
+    interval: Interval
+    score: float = Field(ge=0, le=1)
+    mean_return: float | None
+    games: int
+    unique_games: int | None
+
+
+class Leaderboard(Response):
+    """A page of the leaderboard, best first."""
+
+    league: str
+    computed_at: ComputedAt
+    sides: list[str] = Field(description="Sides that have a separate leaderboard; empty if the sides are symmetric.")
+    side: str | None
+    leaderboard: list[LeaderboardRow]
+    not_champion: str | None = Field(
+        description="Why the best version by rating is not the champion, as a sentence; null if it is, and for the"
+        " results of an earlier game."
+    )
+    total: int = Field(description="Total number of rows.")
+
+
+class PayoffMatrix(StoredDocument):
+    """A payoff matrix."""
+
+    contestants: list[str]
+    score: list[list[float | None]] = Field(
+        description="`score[i][j]`: mean score of i against j; null if they have not played."
+    )
+    games: list[list[int]]
+    by_side: dict[str, list[list[float | None]]] = Field(
+        description="Scores by side: only games in which i alone played this side."
+    )
+    difference: list[list[Any]] = Field(description="Differences in mean return.")
+
+
+class PayoffTable(Response):
+    """The payoff matrix; null before the first game."""
+
+    league: str
+    computed_at: ComputedAt
+    payoff: PayoffMatrix | None
+
+
+class VersionRating(StoredDocument):
+    """A version with its rating."""
+
+    ref: str
+    number: Number
+    made_at: StoredTime
+    steps: int
+    parent: int | None
+    rating: float | None
+    interval: Interval
+    games: int
+    champion_at: list[StoredTime] = Field(description="The times at which it became champion.")
+
+
+class Ratings(Response):
+    """The versions with their ratings, oldest first."""
+
+    league: str
+    computed_at: ComputedAt
+    versions: list[VersionRating]
+
+
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/matches",
+    Page("matches", ListedMatch, "match"),
+    scope="read",
+    tag="Results",
+    parameters=(
+        text("first", "A version or a script: `connect_four@3`, `script:random`."),
+        text("second", "The other contestant."),
+    ),
+)
+def matches(
+    registry: Registry, league: str, limit: int, before: str | None, first: str | None, second: str | None
+) -> Sequence[dict[str, Any]]:
+    """List matches.
+
+    Newest first. With `first` and `second` only the matches between these two contestants, in either order.
+    """
+    if (first is None) != (second is None):
         raise InvalidInput("first and second must be given together")
-    return first, second
+    pair = (first, second) if first is not None and second is not None else None
+    entries = Ledger(registry).page(league, contestants=pair, before=before, limit=limit)
+    current = registry.leagues.get(league).conditions
+    return [_listed(entry, current) for entry in entries]
 
 
-def _listed(entry: LedgerEntry, current: Conditions) -> dict[str, Any]:
-    result = entry.result
-    return {
-        "match": entry.id,
-        "schedule": result.schedule,
-        "position": result.position,
-        "kind": entry.kind,
-        "contestants": list(result.contestants),
-        "scores": list(result.scores),
-        "returns": result.returns and list(result.returns),
-        "games": result.games,
-        "counts": not entry.is_purged and entry.conditions == current,
-        "played_at": entry.played_at.isoformat(),
-    }
-
-
-def _one(registry: Registry, league: str, name: str) -> dict[str, Any]:
-    ledger = Ledger(registry)
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/matches/{schedule}/{position}",
+    MatchWithGames,
+    scope="read",
+    tag="Results",
+    errors=(UnknownMatch,),
+)
+def match(registry: Registry, league: str, schedule: str, position: str) -> dict[str, Any]:
+    """Get a match with its games."""
+    ledger, name = Ledger(registry), f"{schedule}/{position}"
     current = registry.leagues.get(league).conditions
     entry = ledger.entry(name)
-    schedule, match = ledger.scheduled_match(name)
-    if match.league != league:
+    plan, played = ledger.scheduled_match(name)
+    if played.league != league:
         raise UnknownMatch(f"league {league} has no match {name!r}")
-    games = [_game(number, game, match, schedule) for number, game in enumerate(match.games)]
-    return {"league": league} | _listed(entry, current) | {"seed": match.seed, "games": games}
+    games = [_game(number, game, played, plan) for number, game in enumerate(played.games)]
+    return _listed(entry, current) | {"league": league, "seed": played.seed, "games": games}
 
 
-def _game(number: int, game: Game, match: Match, schedule: Schedule) -> dict[str, Any]:
-    who = match.contestants
-    return {
-        "game": number,
-        "sides": {side: who[contestant] for side, contestant in zip(schedule.sides, game.sides, strict=True)},
-        "members": {ref: member for ref, member in zip(who, match.acting(number), strict=True) if ref != member},
-        "scores": list(game.scores),
-        "returns": list(game.returns),
-        "opening": len(game.opening),
-        "actions": len(game.actions),
-        "forfeits": [
-            {"ref": who[forfeit.contestant], "agent": forfeit.agent, "reason": forfeit.reason}
-            for forfeit in game.forfeits
-        ],
-    }
-
-
-def _part(registry: Registry, league: str, game: str | None, part: str) -> str:
-    """Name of the snapshot of current results, or of results of an earlier game."""
-    if game is None:
-        return part
-    summary, _ = _snapshot(registry, league, SUMMARY)
-    games = [earlier_game["name"] for earlier_game in (summary or {}).get("earlier", ())]
-    if game not in games:
-        expected = f"game must be one of {', '.join(games)}" if games else f"{league} has no results of an earlier game"
-        raise InvalidInput(f"{expected}, got {game!r}")
-    return earlier_part(game, part)
-
-
-def _leaderboard(
-    registry: Registry, league: str, game: str | None, side: str | None, offset: int, limit: int
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/leaderboard",
+    Leaderboard,
+    scope="read",
+    tag="Results",
+    parameters=(
+        integer("limit", "Maximum number of rows.", largest=200, default=50),
+        integer("offset", "Number of rows to skip.", smallest=0, default=0),
+        text("side", "One of `sides`: count only the results on this side.", "player_0"),
+        GAME,
+    ),
+)
+def leaderboard(
+    registry: Registry, league: str, limit: int, offset: int, side: str | None, game: str | None
 ) -> dict[str, Any]:
+    """Get the leaderboard."""
     document, computed_at = _snapshot(registry, league, _part(registry, league, game, "leaderboard"))
     document = document or {"leaderboard": [], "by_side": {}}
     sides = list(document["by_side"])
@@ -176,7 +229,72 @@ def _leaderboard(
     }
 
 
-def _snapshot(registry: Registry, league: str, part: str) -> tuple[Any, str | None]:
+@Declaration("GET", "/v1/leagues/{league}/payoff", PayoffTable, scope="read", tag="Results", parameters=(GAME,))
+def payoff(registry: Registry, league: str, game: str | None) -> dict[str, Any]:
+    """Get the payoff matrix.
+
+    Scores and games of the 40 best contestants against each other; null before the first game.
+    """
+    document, computed_at = _snapshot(registry, league, _part(registry, league, game, "payoff"))
+    return {"league": league, "computed_at": computed_at, "payoff": document}
+
+
+@Declaration("GET", "/v1/leagues/{league}/ratings", Ratings, scope="read", tag="Results")
+def ratings(registry: Registry, league: str) -> dict[str, Any]:
+    """Get ratings of all versions.
+
+    The versions, oldest first, with their ratings and the times at which they became champion.
+    """
+    document, computed_at = _snapshot(registry, league, "ratings")
+    return {"league": league, "computed_at": computed_at} | (document or {"versions": []})
+
+
+def _listed(entry: records.LedgerEntry, current: Conditions) -> dict[str, Any]:
+    result = entry.result
+    return {
+        "match": entry.id,
+        "schedule": result.schedule,
+        "position": result.position,
+        "kind": entry.kind,
+        "contestants": result.contestants,
+        "scores": result.scores,
+        "returns": result.returns,
+        "games": result.games,
+        "counts": not entry.is_purged and entry.conditions == current,
+        "played_at": entry.played_at,
+    }
+
+
+def _game(number: int, game: records.Game, match: records.Match, schedule: records.Schedule) -> dict[str, Any]:
+    who = match.contestants
+    return {
+        "game": number,
+        "sides": {side: who[contestant] for side, contestant in zip(schedule.sides, game.sides, strict=True)},
+        "members": {ref: member for ref, member in zip(who, match.acting(number), strict=True) if ref != member},
+        "scores": game.scores,
+        "returns": game.returns,
+        "opening": len(game.opening),
+        "actions": len(game.actions),
+        "forfeits": [
+            {"ref": who[forfeit.contestant], "agent": forfeit.agent, "reason": forfeit.reason}
+            for forfeit in game.forfeits
+        ],
+    }
+
+
+def _part(registry: Registry, league: str, game: str | None, part: str) -> str:
+    """Name of the snapshot of current results, or of results of an earlier game."""
+    if game is None:
+        return part
+    summary, _ = _snapshot(registry, league, SUMMARY)
+    games = [earlier_game["name"] for earlier_game in (summary or {}).get("earlier", ())]
+    if game not in games:
+        expected = f"game must be one of {', '.join(games)}" if games else f"{league} has no results of an earlier game"
+        raise InvalidInput(f"{expected}, got {game!r}")
+    return earlier_part(game, part)
+
+
+def _snapshot(registry: Registry, league: str, part: str) -> tuple[Any, datetime | None]:
     """A snapshot and its time; None before it was computed. Raises UnknownLeague."""
     snapshot = registry.snapshots.get(league, part)
-    return (None, None) if snapshot is None else (snapshot.document, snapshot.at.isoformat())
+    return (None, None) if snapshot is None else (snapshot.document, snapshot.at)

@@ -1,88 +1,87 @@
-"""Lists training runs with their progress and the learning curves of each policy.
+"""Lists training runs with their progress, the learning curves of each policy, and the strength of their versions."""
 
-GET  /v1/leagues/{league}/runs          newest first; ?limit= &before=
-GET  /v1/leagues/{league}/runs/{run}    with settings, curves, and the strength of its versions
-"""
+from collections.abc import Sequence
+from datetime import datetime
+from typing import Annotated, Any, Literal
 
-from typing import Any
-
-from starlette.requests import Request
-from starlette.responses import Response
+from pydantic import AliasPath, Field
 
 from league.errors import UnknownRun
-from league.refs import check_slug
 from league.registry.registry import Registry
-from league.registry.storage.rows import RunPoint, RunRow, StrengthRow
-from serve_app.models.resolver import ModelResolver
-from serve_app.routes import parsing
+from league.registry.storage.rows import RunRow, RunState, StrengthRow
+from serve_app.declaration import Declaration, Page, Response
+
+Curves = Annotated[
+    dict[str, float | None], Field(description="Value by metric; metrics of a policy are named `policy/metric`.")
+]
 
 
-class RunRoutes:
-    """The endpoints."""
+class ListedRun(Response):
+    """A training run."""
 
-    def __init__(self, models: ModelResolver) -> None:
-        self._models = models
-
-    async def page(self, request: Request) -> Response:
-        """A page of a league's training runs. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        limit, before = parsing.page_size(request), parsing.query_name(request, "before")
-
-        def query(registry: Registry) -> dict[str, Any]:
-            rows = registry.runs.newest(league, before=before, limit=limit + 1)
-            page, more = parsing.paginate(rows, limit, lambda row: row.id)
-            return {"league": league, "runs": list(map(_listed, page)), "next": more}
-
-        return await parsing.query_response(self._models, query)
-
-    async def get(self, request: Request) -> Response:
-        """A training run. Raises UnknownLeague or UnknownRun."""
-        league = check_slug("league", request.path_params["league"])
-        run = parsing.path_name(request, "run", UnknownRun)
-
-        def query(registry: Registry) -> dict[str, Any]:
-            row, points = registry.runs.get(league, run), registry.runs.points(league, run)
-            strength = list(map(_strength, registry.strength.of_run(league, run)))
-            details = {"settings": row.settings, "points": list(map(_point, points)), "strength": strength}
-            return {"league": league} | _listed(row) | details
-
-        return await parsing.query_response(self._models, query)
+    run: str = Field(validation_alias="id")
+    algorithm: str
+    state: RunState = Field(
+        description="`silent`: the run has not ended, but its last heartbeat was more than a minute ago."
+    )
+    error: str | None
+    steps: int
+    target: int | None = Field(description="The step budget. Null if only the time is limited.")
+    minutes: float | None = Field(
+        default=None,
+        validation_alias=AliasPath("settings", "minutes"),
+        description="The time budget in minutes. The run ends when either budget is used up.",
+    )
+    seconds: float = Field(description="Training time so far.")
+    seed: int
+    parent: int | None = Field(description="The version from which training was continued.")
+    role: Literal["main", "exploiter"] = Field(description="The role of its versions.")
+    exploits: str | None = Field(description="The version that an exploiter is trained against.")
+    attempts: int = Field(description="How often the run was started or resumed.")
+    curves: Curves
+    began_at: datetime
+    heartbeat_at: datetime
+    ended_at: datetime | None
 
 
-def _listed(row: RunRow) -> dict[str, Any]:
-    return {
-        "run": row.id,
-        "algorithm": row.algorithm,
-        "state": row.state,
-        "error": row.error,
-        "steps": row.steps,
-        "target": row.target,
-        "minutes": row.settings.get("minutes"),
-        "seconds": row.seconds,
-        "seed": row.seed,
-        "parent": row.parent,
-        "role": row.role,
-        "exploits": row.exploits,
-        "attempts": row.attempts,
-        "curves": row.curves,
-        "began_at": row.began_at.isoformat(),
-        "heartbeat_at": row.heartbeat_at.isoformat(),
-        "ended_at": row.ended_at and row.ended_at.isoformat(),
-    }
+class Point(Response):
+    """The values of curves at a step."""
+
+    steps: int
+    at: datetime
+    curves: Curves
 
 
-def _point(point: RunPoint) -> dict[str, Any]:
-    return {"steps": point.steps, "at": point.at.isoformat(), "curves": point.curves}
+class Run(ListedRun):
+    """A training run with its settings, its curves and the strength of its versions."""
+
+    league: str
+    settings: dict[str, Any] = Field(description="The settings of the algorithm.")
+    points: list[Point] = Field(description="Ordered by steps, at most a few hundred.")
+    strength: list[StrengthRow] = Field(
+        description="The scores of its versions against the opponents of `training.strength`, oldest version first."
+    )
 
 
-def _strength(row: StrengthRow) -> dict[str, Any]:
-    return {
-        "version": row.version,
-        "steps": row.steps,
-        "opponent": row.opponent,
-        "games": row.games,
-        "score": row.score,
-        "low": row.low,
-        "high": row.high,
-        "at": row.at.isoformat(),
-    }
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/runs",
+    Page("runs", ListedRun, "run"),
+    scope="read",
+    tag="Results",
+    success="A page of training runs.",
+)
+def runs(registry: Registry, league: str, limit: int, before: str | None) -> Sequence[RunRow]:
+    """List training runs.
+
+    Newest first.
+    """
+    return registry.runs.newest(league, before=before, limit=limit)
+
+
+@Declaration("GET", "/v1/leagues/{league}/runs/{run}", Run, scope="read", tag="Results", errors=(UnknownRun,))
+def run(registry: Registry, league: str, run: str) -> dict[str, Any]:
+    """Get a training run with its metrics."""
+    row, points = registry.runs.get(league, run), registry.runs.points(league, run)
+    details = {"points": points, "strength": registry.strength.of_run(league, run)}
+    return ListedRun.model_validate(row).model_dump() | {"league": league, "settings": row.settings} | details

@@ -24,11 +24,12 @@ from league.refs import CHAMPION, check_alias
 from serve_app.access.access_control import KEY, POLICY_VIOLATION
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.connection_limit import ConnectionLimit, within_descriptors
+from serve_app.declaration import ALIAS, CALLER, REPLICA_HEADER, VERSION, Declaration, Parameter
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
 from serve_app.models.resolver import policy_ref, version_of
 from serve_app.models.version_cache import LoadedVersion
-from serve_app.routes import parsing
+from serve_app.routes.query_string import query_params
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import (
     STREAM_PROTOCOL,
@@ -101,8 +102,40 @@ class StreamRoute:
         self._replicas: int | None = None
         """Number of replicas at the last heartbeat."""
 
+    @Declaration(
+        "WEBSOCKET",
+        "/v1/policies/{model}/stream",
+        scope="act",
+        tag="Inference",
+        name="stream",
+        success="The stream was opened.",
+        status=101,
+        headers=(
+            REPLICA_HEADER,
+            Parameter("x-league-version", {"type": "integer"}, "The version that serves the stream."),
+            Parameter("x-league-sha256", {"type": "string"}, "The digest of the manifest of the version."),
+        ),
+        parameters=(VERSION, Parameter("follow", ALIAS, "The alias to follow, instead of `version`."), CALLER),
+    )
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle a stream until it closes. Raises LeagueError before the handshake is accepted."""
+        """Open a WebSocket for inference.
+
+        A WebSocket (RFC 6455, no subprotocol, no compression) for game servers and robots. Each message gets exactly
+        one response, in order. The connection keeps the recurrent state.
+
+        The stream is pinned to `version`, or to the version that `champion` names when it is opened. With
+        `follow={alias}` each message is served by the version that the alias names at that time; a recurrent policy
+        switches at the start of an episode only.
+
+        **JSON messages** have the fields of the action route, plus `reset: true` at the start of an episode and
+        `return_state: true` to get a token. **Binary messages** have the header `<BBHIQ`: framing 1, flags (1 explore,
+        2 seed, 4 reset, 8 a reset byte for each row, 16 greedy), 0, rows, seed. The inputs follow in the order of
+        `GET /v2/models/{model}`. The response has the header `<BBHIII`: framing 1, 0, 0, rows, version, 0, followed by
+        the actions. **Errors** are JSON with `code`, `message` and `status`; the stream stays open.
+
+        Close codes: 1012, the replica is draining: reconnect to reach another one. 1008, the key was revoked. 1009, a
+        message is too large.
+        """
         await receive()  # the handshake
         with self.connections.opened(scope.get(KEY)):
             stream, headers = await self._create_session(scope)
@@ -167,7 +200,7 @@ class StreamRoute:
             logger.warning("a stream cannot be closed: %s", one_line(error, with_type=True))
 
     async def _create_session(self, scope: Scope) -> tuple[StreamSession, list[tuple[bytes, bytes]]]:
-        model, query = scope["path_params"]["model"], parsing.query_params(scope)
+        model, query = scope["path_params"]["model"], query_params(scope)
         follows = query.get("follow")
         if follows is not None:
             check_alias(follows)

@@ -1,49 +1,107 @@
-"""Sets the canary and shadow of a league, and reports their statistics.
-
-    GET   /v1/leagues/{league}/traffic
-    POST /v1/leagues/{league}/traffic  {"canary": {"version": "candidate", "share": 0.1}, "shadow": null, "reason": "…"}
-
-`version` is a number or an alias. null removes the canary or shadow; an omitted one is unchanged. POST requires a key
-of scope `promote` and an `Idempotency-Key`.
-"""
+"""Sets the canary and shadow of a league, and reports their statistics."""
 
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import Request
-from starlette.responses import JSONResponse
 
+from league.errors import UnknownAlias, UnknownVersion
 from league.histograms import Histogram
-from league.refs import MAX_VERSION, check_slug, parse_version
+from league.refs import MAX_VERSION, parse_version
 from league.registry.registry import Registry
+from league.registry.storage import rows
+from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import Portion, ShadowCounts
 from league.registry.traffic import KEEP, Unchanged
-from serve_app.access.access_control import DEADLINE
-from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
+from serve_app.access.api_keys import ApiKey
+from serve_app.declaration import NUMBER_OR_ALIAS, Declaration, Response
 from serve_app.models.resolver import ModelResolver
 from serve_app.models.shadow import Shadow
 from serve_app.observability.metrics import Metrics, Report
-from serve_app.routes import documents, parsing
+from serve_app.routes.documents import ChangeBody, Number, TrafficSetting
 
 
 class VersionShare(BaseModel):
-    """A version and its share of requests."""
+    """A version, and its share of requests."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
-    version: Annotated[int, Field(ge=1, le=MAX_VERSION)] | str
+    version: Annotated[int, Field(ge=1, le=MAX_VERSION)] | Annotated[str, Field(json_schema_extra=NUMBER_OR_ALIAS)] = (
+        Field(description="The number of a version, or an alias.")
+    )
     share: float = Field(ge=0, le=1)
 
 
-class TrafficBody(parsing.ChangeBody):
-    """The body of a change."""
+class TrafficChange(ChangeBody):
+    """A change of canary and shadow."""
 
     canary: VersionShare | None = None
     shadow: VersionShare | None = None
 
 
+class FollowingReplica(Response):
+    """A replica, and whether it has applied the setting."""
+
+    replica: str
+    follows: bool
+    fault: str | None
+
+
+class Latency(Response):
+    """Upper bounds in milliseconds."""
+
+    p50: float | None
+    p95: float | None
+    p99: float | None
+
+
+class VersionTraffic(Response):
+    """The requests that a version has answered."""
+
+    version: Number
+    requests: int
+    as_canary: int
+    latency_ms: Latency
+
+
+class ShadowTraffic(Response):
+    """A comparison of a shadow with the champion."""
+
+    candidate: Number
+    champion: Number
+    requests: int
+    observations: int
+    agreed: int
+    agreement: float | None
+    failed: int
+    dropped: int
+    skipped: int
+    latency_ms: Latency
+
+
+class TrafficStatistics(Response):
+    """Statistics of all replicas."""
+
+    versions: list[VersionTraffic]
+    shadows: list[ShadowTraffic]
+
+
+class ReplicaStatistics(TrafficStatistics):
+    """Statistics of one replica."""
+
+    replica: str
+
+
+class TrafficReport(TrafficSetting):
+    """The setting of canary and shadow, and the statistics."""
+
+    replicas: list[FollowingReplica]
+    all: TrafficStatistics
+    here: ReplicaStatistics
+
+
 class TrafficRoutes:
-    """The endpoints."""
+    """The endpoint with the statistics of this replica."""
 
     def __init__(self, models: ModelResolver, metrics: Metrics, shadow: Shadow, replica: str) -> None:
         self._models = models
@@ -51,32 +109,39 @@ class TrafficRoutes:
         self._shadow = shadow
         self._replica = replica
 
-    async def show(self, request: Request) -> JSONResponse:
-        """The setting, the replicas that apply it, and statistics of this replica and of all. Raises UnknownLeague."""
-        league = check_slug("league", request.path_params["league"])
-        shadowings = [one for one in self._shadow.shadowings() if one.league == league]
-        replica_statistics = {"replica": self._replica} | _statistics(league, [self._metrics.report()], shadowings)
-        document = await self._models.query(lambda registry: _document(registry, league))
-        return JSONResponse(document | {"here": replica_statistics})
+    @Declaration("GET", "/v1/leagues/{league}/traffic", TrafficReport, scope="read", tag="Read")
+    async def traffic(self, _: Request, league: str) -> dict[str, Any]:
+        """Get canary and shadow traffic.
 
-    async def put(self, request: Request) -> JSONResponse:
-        """Set canary or shadow. Raises UnknownLeague, UnknownVersion, UnknownAlias, KeyReused or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        body = parsing.parse_body(TrafficBody, await read_body(request.scope, request.receive, MAX_CHANGE_BODY))
-        canary = _portion(body.canary) if "canary" in body.model_fields_set else KEEP
-        shadow = _portion(body.shadow) if "shadow" in body.model_fields_set else KEEP
-        key, call = parsing.idempotent_call(request, body)
-        setting = await self._models.change(
-            lambda registry: registry.traffic.set(
-                league, canary=canary, shadow=shadow, actor=key.name, reason=body.reason, call=call
-            ),
-            request.scope[DEADLINE],
-        )
-        return JSONResponse(documents.traffic_document(setting))
+        The setting, the replicas that have applied it, and statistics of this replica (`here`) and of `all` replicas.
+        """
+        shadowings = [shadowing for shadowing in self._shadow.shadowings() if shadowing.league == league]
+        statistics = {"replica": self._replica} | _statistics(league, [self._metrics.report()], shadowings)
+        return await self._models.query(lambda registry: _document(registry, league)) | {"here": statistics}
 
 
-def shadow_document(shadowing: ShadowCounts) -> dict[str, Any]:
-    """Statistics of a shadow as JSON; times are in milliseconds."""
+@Declaration(
+    "POST",
+    "/v1/leagues/{league}/traffic",
+    TrafficSetting,
+    scope="promote",
+    tag="Management",
+    body=TrafficChange,
+    errors=(UnknownVersion, UnknownAlias),
+)
+def set_traffic(
+    registry: Registry, league: str, body: TrafficChange, key: ApiKey, call: IdempotentCall
+) -> rows.Traffic:
+    """Set canary and shadow traffic.
+
+    Omitted fields stay unchanged; null removes a canary or a shadow.
+    """
+    canary = _portion(body.canary) if "canary" in body.model_fields_set else KEEP
+    shadow = _portion(body.shadow) if "shadow" in body.model_fields_set else KEEP
+    return registry.traffic.set(league, canary=canary, shadow=shadow, actor=key.name, reason=body.reason, call=call)
+
+
+def _shadow_document(shadowing: ShadowCounts) -> dict[str, Any]:
     return {
         "candidate": shadowing.candidate,
         "champion": shadowing.champion,
@@ -102,10 +167,11 @@ def _document(registry: Registry, league: str) -> dict[str, Any]:
     acknowledgements = registry.replicas.acknowledgements(league)
     reports = list(registry.replicas.reports().values())
     replicas = [
-        {"replica": one.replica, "follows": one.traffic == setting.id, "fault": one.fault} for one in acknowledgements
+        {"replica": report.replica, "follows": report.traffic == setting.id, "fault": report.fault}
+        for report in acknowledgements
     ]
     statistics = _statistics(league, reports, registry.traffic.shadow_counts(league))
-    return documents.traffic_document(setting) | {"replicas": replicas, "all": statistics}
+    return TrafficSetting.model_validate(setting).model_dump() | {"replicas": replicas, "all": statistics}
 
 
 def _statistics(league: str, reports: list[Report], shadowings: list[ShadowCounts]) -> dict[str, Any]:
@@ -129,7 +195,7 @@ def _statistics(league: str, reports: list[Report], shadowings: list[ShadowCount
             }
             for version, latency in sorted(latencies.items())
         ],
-        "shadows": [shadow_document(one) for one in shadowings],
+        "shadows": [_shadow_document(shadowing) for shadowing in shadowings],
     }
 
 

@@ -1,61 +1,86 @@
 """Lists verdicts of the promotion gate, open and decided, with their evidence.
 
-GET  /v1/leagues/{league}/verdicts              newest first; ?limit= &before=
-GET  /v1/leagues/{league}/verdicts/{verdict}    with the curve of the test and all computed evidence
-
 A verdict is named by its id, or by a unique beginning of its id or digest.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
-from starlette.requests import Request
-from starlette.responses import Response
+from pydantic import ConfigDict, Field
 
 from league.errors import UnknownVerdict
-from league.refs import check_slug
 from league.registry.registry import Registry
 from league.registry.storage.rows import VerdictRow
 from league.results.ledger import Ledger
-from serve_app.models.resolver import ModelResolver
-from serve_app.routes import documents, parsing
+from serve_app.declaration import Declaration, Page
+from serve_app.routes import documents
+from serve_app.routes.documents import ComputedAt, Interval, VerdictDecision
 
 SHOWN = ("llr", "bounds", "blocks", "games", "score", "elo", "interval")
 """Evidence in lists. An open verdict has none."""
 
 
-class VerdictRoutes:
-    """The endpoints."""
+class ListedVerdict(VerdictDecision):
+    """A verdict. Its evidence is null until it is computed."""
 
-    def __init__(self, models: ModelResolver) -> None:
-        self._models = models
-
-    async def page(self, request: Request) -> Response:
-        """A page of a league's verdicts. Raises UnknownLeague or InvalidInput."""
-        league = check_slug("league", request.path_params["league"])
-        limit, before = parsing.page_size(request), parsing.query_name(request, "before")
-
-        def query(registry: Registry) -> dict[str, Any]:
-            rows = registry.verdicts.newest(league, before=before, limit=limit + 1)
-            page, more = parsing.paginate(rows, limit, lambda row: row.id)
-            reasons = registry.snapshots.verdict_reasons(league, [row.id for row in page])
-            verdicts = [_listed(row) | {"reason": _reason(row, *reasons.get(row.id, (None, None)))} for row in page]
-            return {"league": league, "verdicts": verdicts, "next": more}
-
-        return await parsing.query_response(self._models, query)
-
-    async def get(self, request: Request) -> Response:
-        """A verdict with all its evidence. Raises UnknownLeague, UnknownVerdict or InvalidReference."""
-        league = check_slug("league", request.path_params["league"])
-        verdict = parsing.path_name(request, "verdict", UnknownVerdict)
-        return await parsing.query_response(self._models, lambda registry: _one(registry, league, verdict))
+    reason: str | None = Field(
+        description="What decided, and the scores of candidate and champion, in sentences; null before it is computed."
+    )
+    llr: float | None = Field(description="The log-likelihood ratio, or the log wealth of a betting test.")
+    bounds: tuple[float, float] | None = Field(description="The decision bounds.")
+    blocks: int | None = Field(description="Number of counted matches.")
+    games: int | None
+    score: float | None
+    elo: float | None
+    interval: Interval
 
 
-def _listed(row: VerdictRow) -> dict[str, Any]:
-    evidence = row.evidence or {}
-    return documents.verdict_summary(row) | {name: evidence.get(name) for name in SHOWN}
+class Verdict(ListedVerdict):
+    """A verdict with its evidence. Once computed, it has all fields of a verdict in `league report --json`."""
+
+    model_config = ConfigDict(extra="allow")
+
+    league: str
+    computed_at: ComputedAt
+    remedy: str | None = Field(
+        default=None,
+        description="What would have to change for a promotion, in sentences; null after one, and while the verdict is"
+        " open.",
+    )
+    earlier_game: str | None = Field(
+        description="Where the results of its games are, if the league had another game then: the `game` of leaderboard"
+        " and payoffs. Null: its games count today."
+    )
+    curve: list[tuple[float, float]] = Field(default=[], description="[block, LLR] pairs, at most a few hundred.")
 
 
-def _one(registry: Registry, league: str, verdict: str) -> dict[str, Any]:
+@Declaration(
+    "GET", "/v1/leagues/{league}/verdicts", Page("verdicts", ListedVerdict, "verdict"), scope="read", tag="Results"
+)
+def verdicts(registry: Registry, league: str, limit: int, before: str | None) -> Sequence[dict[str, Any]]:
+    """List verdicts.
+
+    Newest first, including open verdicts.
+    """
+    rows = registry.verdicts.newest(league, before=before, limit=limit)
+    reasons = registry.snapshots.verdict_reasons(league, [row.id for row in rows])
+    return [_listed(row) | {"reason": _reason(row, *reasons.get(row.id, (None, None)))} for row in rows]
+
+
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/verdicts/{verdict}",
+    Verdict,
+    scope="read",
+    tag="Results",
+    errors=(UnknownVerdict,),
+)
+def verdict(registry: Registry, league: str, verdict: str) -> dict[str, Any]:
+    """Get a verdict with its evidence.
+
+    By its id or a unique beginning of its digest. Includes the curve of the test, `[block, LLR]`, once the evaluation
+    service has computed it (`computed_at`).
+    """
     row = registry.verdicts.find(verdict, league)
     snapshot = registry.snapshots.get(league, f"verdict/{row.id}")
     conditions = Ledger(registry).schedule(row.schedule).conditions
@@ -64,9 +89,14 @@ def _one(registry: Registry, league: str, verdict: str) -> dict[str, Any]:
     document["earlier_game"] = None if is_current else conditions.name
     if snapshot is not None:
         judgement = snapshot.document
-        document |= {"computed_at": snapshot.at.isoformat()} | judgement | documents.verdict_summary(row)
+        document |= {"computed_at": snapshot.at} | judgement | documents.decision(row)
         document["reason"] = _reason(row, judgement["outcome"], judgement["reason"])
     return document
+
+
+def _listed(row: VerdictRow) -> dict[str, Any]:
+    evidence = row.evidence or {}
+    return documents.decision(row) | {name: evidence.get(name) for name in SHOWN}
 
 
 def _reason(row: VerdictRow, outcome: str | None, reason: str | None) -> str | None:

@@ -146,7 +146,7 @@ def test_a_recorded_game_is_available_as_a_video(client: TestClient, match: Matc
 
 
 def test_agents_and_opponents_are_listed(client: TestClient) -> None:
-    playable_agents = validated("Playable", client.get(f"{LEAGUE}/playable").json())
+    playable_agents = validated("Playability", client.get(f"{LEAGUE}/playable").json())
     assert playable_agents["opponents"] == ["tictactoe@2", "tictactoe@1", "script:random", "script:one_ply"]
     assert [seat["agent"] for seat in playable_agents["agents"]] == ["player_1", "player_2"]
     assert (playable_agents["playable"], playable_agents["draws"]) == (True, True)

@@ -193,7 +193,7 @@ def test_matches_of_a_pair_are_listed_in_either_order(reader: TestClient) -> Non
 
 
 def test_a_match_has_its_games(reader: TestClient) -> None:
-    match = get(reader, f"{BOARD}/matches/{SCHEDULE.id}/5", "Match")
+    match = get(reader, f"{BOARD}/matches/{SCHEDULE.id}/5", "MatchWithGames")
     assert (match["contestants"], match["kind"]) == (["board@2", "script:random"], "round_robin")
     first, second = match["games"]
     assert first["sides"] == {"player_0": "board@2", "player_1": "script:random"}
@@ -381,5 +381,5 @@ def test_responses_after_a_nightly_run_follow_the_document(tmp_path: Path) -> No
             assert verdict["reason"] == each["reason"]
             assert {name: verdict[name] for name in each} == each
         match = get(night, f"{league}/matches", "Matches", limit=1)["matches"][0]
-        games = get(night, f"{league}/matches/{match['match']}", "Match")["games"]
+        games = get(night, f"{league}/matches/{match['match']}", "MatchWithGames")["games"]
         assert [list(game["sides"].values()) for game in games] == [match["contestants"], match["contestants"][::-1]]

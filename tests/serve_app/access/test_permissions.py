@@ -5,9 +5,13 @@ from starlette.routing import Route, WebSocketRoute
 
 from league.registry.registry import Registry
 from serve_app.access import permissions
-from serve_app.access.permissions import PUBLIC, RequiredPermission, for_request, for_rpc
+from serve_app.access.permissions import PUBLIC, Permissions, RequiredPermission, for_rpc
 from serve_app.app import Replica
+from serve_app.routes.table import ROUTES
 from tests.support.servers.replicas import QUICK
+
+PERMISSIONS = Permissions(ROUTES)
+for_request = PERMISSIONS.for_request
 
 
 @pytest.mark.parametrize(
@@ -46,8 +50,9 @@ from tests.support.servers.replicas import QUICK
         ("POST", "/v1/leagues/play", RequiredPermission("promote", "play")),
         ("GET", "/v1/leagues/board/playable", RequiredPermission("read", "board")),
         ("GET", "/v1/leagues/board/matches/s/3/games/0/video.gif", RequiredPermission("read", "board")),
-        ("GET", "/v1/leagues/board/evaluations/3/events", RequiredPermission("read", "board")),
-        ("GET", "/v1/leagues/board/events", RequiredPermission("read", "board")),
+        ("GET", "/v1/leagues/board/evaluations/3/events", RequiredPermission("read", "board", is_stream=True)),
+        ("GET", "/v1/leagues/board/events", RequiredPermission("read", "board", is_stream=True)),
+        ("HEAD", "/v1/leagues/board/events", RequiredPermission("read", "board", is_stream=True)),
         ("GET", "/v1/leagues/board/aliases/champion/history", RequiredPermission("read", "board")),
         ("GET", "/v1/leagues/board/matches/board-gauntlet-1/0", RequiredPermission("read", "board")),
         ("POST", "/v1/leagues/board/verdicts/won", RequiredPermission("promote", "board")),
@@ -103,8 +108,8 @@ def test_all_routes_but_health_documentation_and_pages_need_a_permission(registr
 
 def test_long_paths_and_models_are_not_cached() -> None:
     """They come from requests without a key, too: 4096 of them would keep gigabytes."""
-    sizes = [cached.cache_info().currsize for cached in (permissions._for_request, permissions._for_rpc)]
+    sizes = [cached.cache_info().currsize for cached in (PERMISSIONS._cached, permissions._for_rpc)]
     path, model = f"/v1/leagues/{'x' * 300}", "x" * 300
     assert for_request("http", "GET", path) == RequiredPermission("read", "x" * 300)
     assert for_rpc("ModelReady", model) == RequiredPermission("read", model)
-    assert [cached.cache_info().currsize for cached in (permissions._for_request, permissions._for_rpc)] == sizes
+    assert [cached.cache_info().currsize for cached in (PERMISSIONS._cached, permissions._for_rpc)] == sizes

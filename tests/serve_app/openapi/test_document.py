@@ -14,9 +14,10 @@ from starlette.testclient import TestClient
 from league.errors import LeagueError
 from league.registry.registry import Registry
 from serve_app.access.errors import CODES, status_of
-from serve_app.access.permissions import for_request
+from serve_app.access.permissions import Permissions
 from serve_app.app import Replica
 from serve_app.openapi.document import document
+from serve_app.routes.table import ROUTES
 from serve_app.runtime import haproxy_script
 from serve_app.settings import OWN_PATHS
 from tests.support.servers.replicas import QUICK
@@ -76,9 +77,10 @@ def test_settings_know_the_first_segments_of_all_paths(registry: Registry) -> No
 
 
 def test_it_names_the_required_scope_of_each_operation(openapi: dict[str, Any]) -> None:
+    permissions = Permissions(ROUTES)
     for path, method, operation in operations(openapi):
         kind = "websocket" if "101" in operation["responses"] else "http"
-        need = for_request(kind, method, path.format(**NAMES))
+        need = permissions.for_request(kind, method, path.format(**NAMES))
         assert operation.get("x-scope") == need.scope, path
         security = operation.get("security", openapi["security"])
         assert security == ([] if need.scope is None else security), path

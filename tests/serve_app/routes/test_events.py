@@ -52,7 +52,8 @@ def test_an_evaluation_is_reported_until_it_has_ended(server: Listening, registr
     with listen(server, f"{path}/events") as stream, listen(server) as league:
         assert [(name, found["state"]) for name, found in stream.events] == [("evaluation", "queued")]
         assert registry.evaluations.claim("me", 1) is not None
-        progress = {"what": "2 contestants", "played": 3, "of": 8, "llr": None, "bounds": None}
+        progress = {"what": "2 contestants", "played": 3, "of": 8}
+        progress |= dict.fromkeys(("moves_per_second", "llr", "bounds"))
         registry.evaluations.heartbeat(number, "me", progress)
         until(lambda: stream.last["progress"] == progress)
         until(lambda: league.last["evaluations"] == [{"evaluation": number, "state": "running", "progress": progress}])
