@@ -273,6 +273,22 @@ def versions(registry: Registry, league: str, limit: int | None, before: int | N
 
 
 @Declaration(
+    "GET",
+    "/v1/leagues/{league}/versions/{version}",
+    ListedVersion,
+    scope="read",
+    tag="Read",
+    errors=(UnknownVersion, UnknownAlias),
+)
+def version(registry: Registry, league: str, version: str) -> VersionRow:
+    """Get a version.
+
+    By its number, or by an alias that names it now.
+    """
+    return registry.versions.resolve(CheckpointRef(league, parse_version(version)))
+
+
+@Declaration(
     "PUT",
     "/v1/leagues/{league}/versions/{version}/note",
     ListedVersion,

@@ -36,7 +36,22 @@ def test_versions(read_only_client: TestClient, storage: Storage) -> None:
     registry.close()
 
 
-@pytest.mark.parametrize("path", ["/v1/leagues/nobody", "/v1/leagues/nobody/versions"])
+def test_a_version(read_only_client: TestClient) -> None:
+    versions = read_only_client.get("/v1/leagues/board/versions").json()["versions"]
+    assert read_only_client.get("/v1/leagues/board/versions/2").json() == versions[1]
+    assert read_only_client.get("/v1/leagues/board/versions/champion").json() == versions[0]
+
+
+@pytest.mark.parametrize(
+    ("version", "status", "code"),
+    [("9", 404, "unknown_version"), ("nobody", 404, "unknown_alias"), ("NO", 400, "invalid_reference")],
+)
+def test_an_unknown_version_is_reported(read_only_client: TestClient, version: str, status: int, code: str) -> None:
+    reply = read_only_client.get(f"/v1/leagues/board/versions/{version}")
+    assert (reply.status_code, reply.json()["code"]) == (status, code)
+
+
+@pytest.mark.parametrize("path", ["/v1/leagues/nobody", "/v1/leagues/nobody/versions", "/v1/leagues/nobody/versions/1"])
 def test_an_unknown_league_is_reported(read_only_client: TestClient, path: str) -> None:
     reply = read_only_client.get(path)
     assert (reply.status_code, reply.json()["code"]) == (404, "unknown_league")
