@@ -26,7 +26,7 @@ def page() -> str:
             calls = {method: call for method, call in item.items() if method != "parameters"}
             parts += [_call(api, method, path, call) for method, call in calls.items() if tag["name"] in call["tags"]]
     schemas = api["components"]["schemas"].items()
-    parts += ["## Documents", *(_schema(name, schema) for name, schema in sorted(schemas) if "properties" in schema)]
+    parts += ["## Documents", *(_schema(name, schema) for name, schema in sorted(schemas))]
     return "\n\n".join(part.strip("\n") for part in parts) + "\n"
 
 
@@ -55,8 +55,11 @@ def _resolved(api: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
 
 
 def _schema(name: str, schema: dict[str, Any]) -> str:
+    parts = [f"### {name}", schema.get("description", "")]
+    if "properties" not in schema:
+        return "\n\n".join([*parts, f"Type: {_type(schema)}."])
     rows = [(f"`{field}`", _type(part), part.get("description", "")) for field, part in schema["properties"].items()]
-    return "\n\n".join([f"### {name}", schema.get("description", ""), _table(("field", "type", "description"), rows)])
+    return "\n\n".join([*parts, _table(("field", "type", "description"), rows)])
 
 
 def _content(node: dict[str, Any]) -> str:
