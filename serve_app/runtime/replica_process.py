@@ -30,4 +30,4 @@ def this_process() -> ReplicaProcess:
 
 def has_ended(other: Mapping[str, str]) -> bool:
     """Whether a process ran on this machine, since its last start and in this container, and has ended."""
-    return processes.has_ended(other[PROCESS])
+    return PROCESS in other and processes.has_ended(other[PROCESS])
