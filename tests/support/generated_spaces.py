@@ -38,7 +38,7 @@ from league.spaces import ACTION_MASK, inputs
 from league.spaces.arrays import mask_size, tensors
 from league.spaces.conversion import from_gymnasium, to_gymnasium
 from serve_app.app import Replica
-from serve_app.openapi.document import observation as example
+from serve_app.openapi.examples import observation as example
 from serve_app.settings import ServeSettings
 from training.algorithms.ppo import algorithm_config
 from training.export import parity

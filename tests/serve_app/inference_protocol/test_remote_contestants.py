@@ -49,9 +49,9 @@ def test_a_key_is_sent_only_to_the_server_that_it_is_for(
     received = list[str | None]()
     admit = replica.server.access.admit_request
 
-    def record(scope: Any, headers: RequestHeaders) -> Any:
+    def record(scope: Any, need: Any, headers: RequestHeaders) -> Any:
         received.append(None if headers.token is None else headers.token.decode())
-        return admit(scope, headers)
+        return admit(scope, need, headers)
 
     monkeypatch.setattr(replica.server.access, "admit_request", record)
     host = replica.http.partition(":")[2]
