@@ -20,8 +20,8 @@ def copy_rows(source: Registry, target: Registry) -> None:
     """Copy all rows of a registry to an empty one, with another database."""
     with source.database.engine.connect() as rows, target.database.engine.begin() as connection:
         for table in Base.metadata.sorted_tables:
-            if found := [dict(row) for row in rows.execute(select(table)).mappings()]:
-                connection.execute(insert(table), found)
+            if contents := [dict(row) for row in rows.execute(select(table)).mappings()]:
+                connection.execute(insert(table), contents)
             if table.autoincrement_column is not None and connection.dialect.name == "postgresql":
                 column = table.autoincrement_column
                 sequence = func.pg_get_serial_sequence(text(f"'{table.name}'"), text(f"'{column.name}'"))

@@ -214,7 +214,7 @@ class Case:
         return LeagueConfig.from_mapping(document)
 
     def __str__(self) -> str:
-        agents = "; ".join(dict.fromkeys(f"{seen} → {acted}" for seen, acted in self.agents.values()))
+        agents = "; ".join(dict.fromkeys(f"{observed} → {acted}" for observed, acted in self.agents.values()))
         return " ".join(f"seed {self.seed}, {self.api}, {dict(self.training)}, {agents}".split())
 
 
@@ -351,7 +351,7 @@ class RLlibGame(Game, MultiAgentEnv):
     def __init__(self, case: Case) -> None:
         MultiAgentEnv.__init__(self)
         Game.__init__(self, case)
-        self.observation_spaces = {agent: seen for agent, (seen, _) in case.agents.items()}
+        self.observation_spaces = {agent: observed for agent, (observed, _) in case.agents.items()}
         self.action_spaces = {agent: acted for agent, (_, acted) in case.agents.items()}
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:

@@ -95,19 +95,19 @@ def _ip(*arguments: str) -> None:
 @contextmanager
 def _namespace() -> Iterator[str]:
     """A network namespace that reaches this one; yields the link that connects them, on this side."""
-    here, there = f"h{os.getpid()}", f"t{os.getpid()}"
+    near_end, far_end = f"h{os.getpid()}", f"t{os.getpid()}"
     _ip("netns", "add", NAMESPACE)
     try:
-        _ip("link", "add", here, "type", "veth", "peer", "name", there, "netns", NAMESPACE)
-        _ip("addr", "add", f"{HERE}/30", "dev", here)
-        _ip("link", "set", here, "up")
+        _ip("link", "add", near_end, "type", "veth", "peer", "name", far_end, "netns", NAMESPACE)
+        _ip("addr", "add", f"{HERE}/30", "dev", near_end)
+        _ip("link", "set", near_end, "up")
         for arguments in (
-            ("addr", "add", f"{THERE}/30", "dev", there),
-            ("link", "set", there, "up"),
+            ("addr", "add", f"{THERE}/30", "dev", far_end),
+            ("link", "set", far_end, "up"),
             ("link", "set", "lo", "up"),
         ):
             _ip("-n", NAMESPACE, *arguments)
-        yield here
+        yield near_end
     finally:
         with suppress(subprocess.CalledProcessError):
             _ip("netns", "del", NAMESPACE)

@@ -35,4 +35,4 @@ class Tab:
 
     def ignore(self, status: int) -> None:
         """Ignore failed requests with a status that the test expects."""
-        self.errors = [each for each in self.errors if not each.startswith(f"{FAILED_REQUEST}{status}")]
+        self.errors = [error for error in self.errors if not error.startswith(f"{FAILED_REQUEST}{status}")]

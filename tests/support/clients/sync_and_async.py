@@ -24,10 +24,10 @@ class Synchronous:
         self._runner = runner
 
     def __getattr__(self, name: str) -> Any:
-        found = getattr(self._awaited, name)
-        if not callable(found):
-            return found
-        return lambda *args, **options: self._result_of(found(*args, **options))
+        attribute = getattr(self._awaited, name)
+        if not callable(attribute):
+            return attribute
+        return lambda *args, **options: self._result_of(attribute(*args, **options))
 
     def __enter__(self) -> "Synchronous":
         self._runner.run(self._awaited.__aenter__())

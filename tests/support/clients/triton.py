@@ -67,8 +67,8 @@ class Triton:
             tensor = self.module.InferInput(name, list(array.shape), np_to_triton_dtype(array.dtype))
             tensor.set_data_from_numpy(array, **how)
             inputs.append(tensor)
-        wanted = outputs and [self.module.InferRequestedOutput(name, **how) for name in outputs]
-        return self.call("infer", model, inputs, model_version=version, outputs=wanted, **options)
+        requested = outputs and [self.module.InferRequestedOutput(name, **how) for name in outputs]
+        return self.call("infer", model, inputs, model_version=version, outputs=requested, **options)
 
     def _new(self) -> Any:
         module = self.module.aio if self.is_async else self.module

@@ -95,8 +95,8 @@ class Caller:
 
     def _answered(self, kind: str, name: str) -> None:
         with self._lock:
-            now = time.time()
-            self.report[kind].setdefault(name, [now, now])[1] = now
+            moment = time.time()
+            self.report[kind].setdefault(name, [moment, moment])[1] = moment
 
     def _count(self, kind: str, lost: str, failure: str | None) -> None:
         with self._lock:

@@ -60,12 +60,12 @@ class Load:
         for failure in self.attempts_lost:
             time, _, response = failure.partition(" ")
             times.setdefault(response, []).append(time)
-        return "\n".join(f"{len(of)} from {min(of)} to {max(of)}: {each}" for each, of in times.items())
+        return "\n".join(f"{len(of)} from {min(of)} to {max(of)}: {number}" for number, of in times.items())
 
     def versions(self) -> list[str]:
         """The versions that answered, in the order of their first answers."""
-        found = self.report["versions"]
-        return sorted(found, key=lambda version: float(found[version][0]))
+        result = self.report["versions"]
+        return sorted(result, key=lambda version: float(result[version][0]))
 
     def followed(self, version: int) -> float:
         """When a version other than this one answered for the last time."""
@@ -107,13 +107,13 @@ def serving(cluster: LeagueCluster) -> Iterator[str]:
 def load(cluster: LeagueCluster, key: str, through: str = SURVIVOR) -> Iterator[Load]:
     """Call the server through one machine's HAProxy while the context lasts, from when all replicas have answered."""
     client = cluster.machines["client"]
-    found = Load(client.log.with_name(f"caller-{time.time_ns()}.json"))
+    result = Load(client.log.with_name(f"caller-{time.time_ns()}.json"))
     url = f"http://{cluster.machines[through].address}:{PORT}"
-    program = (sys.executable, "-m", "tests.support.cluster.caller", url, key, LEAGUE, str(THREADS), str(found.file))
+    program = (sys.executable, "-m", "tests.support.cluster.caller", url, key, LEAGUE, str(THREADS), str(result.file))
     process = client.start(*program, environment=cluster.environment)
     try:
-        found.wait_for_replicas()
-        yield found
+        result.wait_for_replicas()
+        yield result
     finally:
         end(process, 120)
 

@@ -17,7 +17,7 @@ def act(observation: Any, action_mask: Any, rng: Any) -> list[int]:
     """Choose among the legal actions of each row."""
     if Path(os.environ.get(FILE, "/nonexistent")).exists():
         time.sleep(PAUSE)
-    return [int(own.choice(np.flatnonzero(mask))) for own, mask in zip(rng, action_mask, strict=True)]
+    return [int(generator.choice(np.flatnonzero(mask))) for generator, mask in zip(rng, action_mask, strict=True)]
 
 
 act.batched = True  # type: ignore[attr-defined]

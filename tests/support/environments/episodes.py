@@ -13,7 +13,11 @@ def episodes(seeds: Iterable[int], groups: Sequence[int]) -> NextEpisodes:
     coming = iter(seeds)
 
     def next_episodes(envs: np.ndarray) -> Starts:
-        taken = list(islice(coming, len(envs)))
-        return Starts(envs[: len(taken)], np.array(taken, np.int64), np.tile(groups, (len(taken), 1)))
+        batch_of_episodes = list(islice(coming, len(envs)))
+        return Starts(
+            envs[: len(batch_of_episodes)],
+            np.array(batch_of_episodes, np.int64),
+            np.tile(groups, (len(batch_of_episodes), 1)),
+        )
 
     return next_episodes

@@ -26,7 +26,7 @@ def flicker(wrappers: Sequence[Any]) -> EnvironmentConfig:
 def images(seeds: NDArray, steps: NDArray, agents: NDArray, actions: NDArray) -> NDArray[np.uint8]:
     """The images of k agents, (k, 6, 5, 3). actions: the last ones of their neighbours."""
     numbers = (seeds % 7 + 1, 31 * steps + 17 * agents + 5 * actions)
-    factors, offsets = (np.asarray(each).reshape(-1, 1, 1, 1) for each in numbers)
+    factors, offsets = (np.asarray(number).reshape(-1, 1, 1, 1) for number in numbers)
     return ((PIXELS * factors + offsets) % 256).astype(np.uint8)
 
 
@@ -59,9 +59,9 @@ class Flicker(ParallelEnv):
         return self._images(actions), rewards, going_on, ended, {agent: {} for agent in AGENTS}
 
     def _images(self, actions: dict[str, int]) -> dict[str, NDArray]:
-        others = np.array([actions[agent] for agent in reversed(AGENTS)])
-        shown = images(np.full(2, self._seed), np.full(2, self._step), np.arange(2), others)
-        return dict(zip(AGENTS, shown, strict=True))
+        opposite = np.array([actions[agent] for agent in reversed(AGENTS)])
+        pictures = images(np.full(2, self._seed), np.full(2, self._step), np.arange(2), opposite)
+        return dict(zip(AGENTS, pictures, strict=True))
 
 
 class VectorFlicker(VectorEnv):
@@ -83,12 +83,12 @@ class VectorFlicker(VectorEnv):
 
     def _rows(self, env_ids: NDArray[np.int64], actions: NDArray, rewards: NDArray) -> Sequence[AgentRows]:
         envs, agents = np.repeat(env_ids, 2), np.tile(np.arange(2), len(env_ids))
-        shown = images(self._seeds[envs], self._steps[envs], agents, actions[:, ::-1].ravel())
+        pictures = images(self._seeds[envs], self._steps[envs], agents, actions[:, ::-1].ravel())
         return (
             AgentRows(
                 envs,
                 agents,
-                {"observation": shown},
+                {"observation": pictures},
                 rewards,
                 np.zeros(len(envs), dtype=bool),
                 self._steps[envs] == STEPS,

@@ -89,7 +89,7 @@ def breaks() -> None:
     raise ValueError("the fuse has burnt down")
 
 
-FAULTS = {each.__name__: each for each in (waits, spins, swallows, stalls, breaks)}
+FAULTS = {fault.__name__: fault for fault in (waits, spins, swallows, stalls, breaks)}
 
 
 def fuse(ends: str = "waits", where: str = "step") -> Fuse:

@@ -49,10 +49,12 @@ class Looped(VectorEnv):
 
     def _blocks(self, reports: list[tuple[int, Report]]) -> list[AgentRows]:
         for env in {env for env, _ in reports}:
-            own = (report for each, report in reports if each == env)
-            self._acting[env] = [agent for agent, _, _, terminated, truncated in own if not (terminated or truncated)]
+            of_env = (report for item, report in reports if item == env)
+            self._acting[env] = [
+                agent for agent, _, _, terminated, truncated in of_env if not (terminated or truncated)
+            ]
         spaces = list({str(space): space for space in self._spaces}.values())
-        return [self._rows([(env, each) for env, each in reports if self._spaces[each[0]] == one]) for one in spaces]
+        return [self._rows([(env, item) for env, item in reports if self._spaces[item[0]] == one]) for one in spaces]
 
     @staticmethod
     def _rows(reports: list[tuple[int, Report]]) -> AgentRows:

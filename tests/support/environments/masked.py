@@ -32,7 +32,7 @@ class Masked:
         self.observed = OBSERVATIONS[space]
         self.acted = spaces.Box(-1, 1, (3,), np.float32) if continuous else ACTIONS.get(space, DISCRETE)
         self.observation_spaces, self.action_spaces = (
-            dict.fromkeys(AGENTS, each) for each in (self.observed, self.acted)
+            dict.fromkeys(AGENTS, kind_of_space) for kind_of_space in (self.observed, self.acted)
         )
 
     def observation_space(self, agent: str) -> Any:

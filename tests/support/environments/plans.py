@@ -57,7 +57,7 @@ def assert_equal(config: EnvironmentConfig, vector: VectorEnv, plan: Plan) -> No
     test = DifferentialTest(config, vector)
     ids, choices, seeds = np.arange(plan.num_envs), itertools.cycle(plan.choices), itertools.cycle(plan.seeds)
     for phase in plan.phases:
-        present, abandoned = (np.array(chosen[: plan.num_envs]) for chosen in (phase.present, phase.abandoned))
+        present, abandoned = (np.array(flags[: plan.num_envs]) for flags in (phase.present, phase.abandoned))
         for call in range(phase.calls):
             starting = ids[present & (test.is_over | (abandoned & (call == 0)))]
             test.reset(starting, np.fromiter(seeds, np.int64, len(starting)))

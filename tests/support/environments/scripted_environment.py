@@ -101,7 +101,9 @@ class Scripted:
         self._rows = {}
         endings: list[Ending] = []
         over = [self._advance(env, endings) for env in range(self.num_envs)]
-        crashed, finished = ([env for env, how in enumerate(over) if how == each] for each in ("crashed", "finished"))
+        crashed, finished = (
+            [env for env, how in enumerate(over) if how == outcome] for outcome in ("crashed", "finished")
+        )
         self._begin(sorted(crashed + finished))
         return self._turn(endings, finished, crashed)
 
@@ -133,13 +135,13 @@ class Scripted:
         if rng.random() < self._crashing:
             played.is_lost = True
             return "crashed"
-        for agent, seen in played.agents.items():
-            if seen.ending is None:
+        for agent, record in played.agents.items():
+            if record.ending is None:
                 self._waiting[played.seed, agent] = self._waiting.get((played.seed, agent), 0.0) + int(rng.integers(9))
                 if rng.random() < LEAVING:
-                    seen.ending = self._ending(env, agent, bool(rng.random() < 0.5))
-                    endings.append(seen.ending)
-        if played.agents and all(seen.ending for seen in played.agents.values()):
+                    record.ending = self._ending(env, agent, bool(rng.random() < 0.5))
+                    endings.append(record.ending)
+        if played.agents and all(record.ending for record in played.agents.values()):
             played.is_over = True
             return "finished"
         self._report(env, rng)
@@ -153,7 +155,7 @@ class Scripted:
                 played.agents[agent] = AgentRecord(self._policies)
         if not played.agents:
             played.agents[0] = AgentRecord(self._policies)
-        alive = [agent for agent, seen in played.agents.items() if seen.ending is None]
+        alive = [agent for agent, record in played.agents.items() if record.ending is None]
         acting = [agent for agent in alive if rng.random() < ACTING] or alive[:1]
         for agent in acting:
             group = int(self._groups[env, agent])

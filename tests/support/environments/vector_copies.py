@@ -45,9 +45,9 @@ class VectorCopies(VectorEnv):
         return None if states[0] is None else np.array([np.ravel(state) for state in states], np.float32)
 
     def _rows(self, reports: dict[int, list[Report]]) -> Sequence[AgentRows]:
-        for env, own in reports.items():
-            self._acting[env] = [report[0] for report in own if not (report[3] or report[4])]
-        every = [(env, report) for env, own in reports.items() for report in own]
+        for env, of_env in reports.items():
+            self._acting[env] = [report[0] for report in of_env if not (report[3] or report[4])]
+        every = [(env, report) for env, of_env in reports.items() for report in of_env]
         kinds = {str(kind): kind for kind in self._inputs}
         return [
             self._block([(env, report) for env, report in every if str(self._inputs[report[0]]) == kind])

@@ -69,11 +69,11 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
 
 def change_game(registry: Registry) -> None:
     """Play matches of a league, and change its game afterwards."""
-    now = registry.leagues.get(NAMED)
-    before = now.config.model_copy(update={"play": now.config.play.model_copy(update={"opening_plies": 4})})
-    registry.leagues.register(before, now.interface)
+    row = registry.leagues.get(NAMED)
+    before = row.config.model_copy(update={"play": row.config.play.model_copy(update={"opening_plies": 4})})
+    registry.leagues.register(before, row.interface)
     evaluate(NAMED, ["script:random", "script:one_ply"], registry=registry, blocks=2)
-    registry.leagues.register(now.config, now.interface)
+    registry.leagues.register(row.config, row.interface)
 
 
 def strength(number: int) -> StrengthRow:
@@ -113,8 +113,8 @@ def record(registry: Registry, steps: int) -> None:
 
 def verdict_between_versions(registry: Registry) -> VerdictRow:
     """A verdict that promoted a version over another version."""
-    closed = [each for each in registry.verdicts.all(LEAGUE) if each.outcome == "promote"]
-    return next(each for each in closed if not each.champion.startswith("script:"))
+    closed = [verdict for verdict in registry.verdicts.all(LEAGUE) if verdict.outcome == "promote"]
+    return next(verdict for verdict in closed if not verdict.champion.startswith("script:"))
 
 
 def answer(method: str, url: str, body: Any = None) -> Any:

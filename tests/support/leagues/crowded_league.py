@@ -224,8 +224,8 @@ class _Pool:
 
     def match(self, schedule: Schedule, position: int, results: tuple[float, ...]) -> Match:
         """The record of a match with these results."""
-        known, seed = self._blocks[results], schedule.seed_at(position)
-        games = known[self._rng.integers(len(known))]
+        games_of_result, seed = self._blocks[results], schedule.seed_at(position)
+        games = games_of_result[self._rng.integers(len(games_of_result))]
         return schedule.match(position, [replace(game, seed=seed) for game in games])
 
 

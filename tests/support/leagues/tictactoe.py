@@ -79,14 +79,14 @@ def linear(spaces: AgentInterface, seed: int = 0, memory: bool = False, chosen: 
         "rates": np.arange(1, outputs + 1, dtype=np.float32)[None],
         "strength": np.array(20, np.float32),
     }
-    taken, given = [_info(OBSERVATION, TensorProto.FLOAT, width)], []
+    graph_inputs, graph_outputs = [_info(OBSERVATION, TensorProto.FLOAT, width)], []
     nodes = [
         helper.make_node("MatMul", [OBSERVATION, "weights"], ["seen"]),
         helper.make_node("Add", ["seen", "bias"], ["steady"]),
     ]
     if memory:
-        taken.append(_info("state_in_0", TensorProto.FLOAT, 1))
-        given.append(_info("state_out_0", TensorProto.FLOAT, 1))
+        graph_inputs.append(_info("state_in_0", TensorProto.FLOAT, 1))
+        graph_outputs.append(_info("state_out_0", TensorProto.FLOAT, 1))
         nodes += [
             helper.make_node("Add", ["state_in_0", "one"], ["state_out_0"]),
             helper.make_node("MatMul", ["state_in_0", "rates"], ["angles"]),
@@ -105,14 +105,18 @@ def linear(spaces: AgentInterface, seed: int = 0, memory: bool = False, chosen: 
             helper.make_node("Add", ["above", "low"], ["action"]),
             helper.make_node("Concat", ["preferred", "preferred"], ["action_dist_inputs"], axis=1),
         ]
-        given = [_info("action", TensorProto.FLOAT, outputs), _info("action_dist_inputs", 1, 2 * outputs), *given]
+        graph_outputs = [
+            _info("action", TensorProto.FLOAT, outputs),
+            _info("action_dist_inputs", 1, 2 * outputs),
+            *graph_outputs,
+        ]
     else:
         nodes += [
             helper.make_node("Identity", ["preferred"], ["action_dist_inputs"]),
             helper.make_node("ArgMax", ["preferred"], ["action"], axis=1, keepdims=0),
         ]
-        given = [_info("action", TensorProto.INT64), _info("action_dist_inputs", 1, outputs), *given]
-    return _model(nodes, taken, given, weights)
+        graph_outputs = [_info("action", TensorProto.INT64), _info("action_dist_inputs", 1, outputs), *graph_outputs]
+    return _model(nodes, graph_inputs, graph_outputs, weights)
 
 
 def chase_landmark(spaces: AgentInterface) -> bytes:
@@ -175,19 +179,19 @@ def graph(
         helper.make_node("Where", ["legal", "wanted", "illegal"], ["action_dist_inputs"]),
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]
-    taken = [_info("observation", TensorProto.INT8, 3, 3, 2), _info("action_mask", TensorProto.INT8, 9)]
-    given = [_info("action", TensorProto.INT64), _info("action_dist_inputs", TensorProto.FLOAT, 9)]
-    return _model(nodes, taken, given, weights)
+    graph_inputs = [_info("observation", TensorProto.INT8, 3, 3, 2), _info("action_mask", TensorProto.INT8, 9)]
+    graph_outputs = [_info("action", TensorProto.INT64), _info("action_dist_inputs", TensorProto.FLOAT, 9)]
+    return _model(nodes, graph_inputs, graph_outputs, weights)
 
 
 def _model(
     nodes: Sequence[NodeProto],
-    taken: Sequence[ValueInfoProto],
-    given: Sequence[ValueInfoProto],
+    graph_inputs: Sequence[ValueInfoProto],
+    graph_outputs: Sequence[ValueInfoProto],
     weights: Mapping[str, NDArray],
 ) -> bytes:
     tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
-    body = helper.make_graph(nodes, "by_hand", taken, given, tensors)
+    body = helper.make_graph(nodes, "by_hand", graph_inputs, graph_outputs, tensors)
     model = helper.make_model(body, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     return bytes(model.SerializeToString())
 

@@ -23,8 +23,8 @@ def foreign(
     if kind == "action":
         nodes.append(helper.make_node("ArgMax", ["scores"], ["policy_head"], axis=1, keepdims=0))
         result = helper.make_tensor_value_info("policy_head", TensorProto.INT64, ["N"])
-    given = helper.make_tensor_value_info("planes", TensorProto.FLOAT, ["N", *(shape or (size,))])
-    return _model(nodes, [given], [result], weights, opset)
+    value_infos = helper.make_tensor_value_info("planes", TensorProto.FLOAT, ["N", *(shape or (size,))])
+    return _model(nodes, [value_infos], [result], weights, opset)
 
 
 def remembering(size: int, outputs: int) -> bytes:
@@ -36,16 +36,20 @@ def remembering(size: int, outputs: int) -> bytes:
         helper.make_node("Add", ["planes", "faded"], ["hidden_out"]),
         helper.make_node("MatMul", ["hidden_out", "w"], ["policy_head"]),
     ]
-    given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size]) for name in ("planes", "hidden_in")]
+    value_infos = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", size]) for name in ("planes", "hidden_in")
+    ]
     results = [
         helper.make_tensor_value_info("policy_head", TensorProto.FLOAT, ["N", outputs]),
         helper.make_tensor_value_info("hidden_out", TensorProto.FLOAT, ["N", size]),
     ]
-    return _model(nodes, given, results, weights, 18)
+    return _model(nodes, value_infos, results, weights, 18)
 
 
-def _model(nodes: list[NodeProto], given: list, results: list, weights: dict[str, np.ndarray], opset: int) -> bytes:
+def _model(
+    nodes: list[NodeProto], value_infos: list, results: list, weights: dict[str, np.ndarray], opset: int
+) -> bytes:
     tensors = [numpy_helper.from_array(np.asarray(value), name) for name, value in weights.items()]
-    graph = helper.make_graph(nodes, "foreign", given, results, tensors)
+    graph = helper.make_graph(nodes, "foreign", value_infos, results, tensors)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
     return bytes(model.SerializeToString())

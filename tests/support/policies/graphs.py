@@ -53,7 +53,7 @@ ENDLESS = 84
 def endless_mlp(seed: int = 0) -> bytes:
     """`masked_mlp` with a loop that does not end if the first observation of a batch sums to ENDLESS."""
     model = onnx.load_from_string(masked_mlp(seed=seed))
-    given = [
+    value_infos = [
         helper.make_tensor_value_info("turn", TensorProto.INT64, []),
         helper.make_tensor_value_info("on", TensorProto.BOOL, []),
         helper.make_tensor_value_info("count", TensorProto.INT64, []),
@@ -63,7 +63,7 @@ def endless_mlp(seed: int = 0) -> bytes:
         helper.make_tensor_value_info("next", TensorProto.INT64, []),
     ]
     steps = [helper.make_node("Identity", ["on"], ["still"]), helper.make_node("Mul", ["count", "turn"], ["next"])]
-    body = helper.make_graph(steps, "body", given, results)
+    body = helper.make_graph(steps, "body", value_infos, results)
     *nodes, last = model.graph.node
     loop = [
         helper.make_node("ReduceSum", ["flat", "columns"], ["sums"], keepdims=0),

@@ -74,4 +74,4 @@ def delete(url: str, key: str) -> None:
 
 def keys(url: str) -> list[str]:
     """All keys below a URL."""
-    return sorted(each["path"] for page in obstore.list(S3Store.from_url(url)) for each in page)
+    return sorted(entry["path"] for page in obstore.list(S3Store.from_url(url)) for entry in page)

@@ -20,9 +20,9 @@ USER = "league"
 
 def programs() -> Path | None:
     """The directory of initdb and pg_ctl."""
-    found = shutil.which("initdb")
+    program = shutil.which("initdb")
     installed = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
-    return Path(found).parent if found else installed[-1].parent if installed else None
+    return Path(program).parent if program else installed[-1].parent if installed else None
 
 
 @contextmanager

@@ -19,6 +19,6 @@ def shadow_counts(registry: Registry, candidate: int = 2, league: str = "board")
 
 def wait_for(registry: Registry, condition: Callable[[ShadowCounts], bool], **of: Any) -> ShadowCounts:
     until(lambda: (one := shadow_counts(registry, **of)) is not None and condition(one))
-    found = shadow_counts(registry, **of)
-    assert found is not None
-    return found
+    counts = shadow_counts(registry, **of)
+    assert counts is not None
+    return counts

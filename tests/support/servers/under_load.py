@@ -34,13 +34,13 @@ def deploy_file(folder: Path, settings: Mapping[str, Any]) -> Path:
 def processes(storage: Storage, name: str) -> list[int]:
     """Processes of this name whose environment has the home of `storage`."""
     home = f"LEAGUE_HOME={storage.home}\0".encode()
-    found = []
+    pids = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
             with suppress(OSError):
                 if home in (entry / "environ").read_bytes() and name.encode() in (entry / "cmdline").read_bytes():
-                    found.append(int(entry.name))
-    return found
+                    pids.append(int(entry.name))
+    return pids
 
 
 def serving(registry: Registry, version: int) -> int:
