@@ -10,8 +10,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PRODUCT = ("league", "training", "serve_app", "evaluation", "policy_league")
 GENERATED = ("migrations/", "_pb2.py", "_sync/")
-MAX_MODULES = 14
-ONE_PER_RESOURCE = {"serve_app/routes": 20}
+MAX_LINES, MAX_DEPENDENCIES = 3_000, 14
+"""Budget of a package, without its sub-packages: lines, and other packages of the product that it imports."""
 
 
 def modules(*packages: str) -> list[Path]:
@@ -25,10 +25,19 @@ def tree(path: Path) -> ast.Module:
     return ast.parse((ROOT / path).read_text())
 
 
-def test_a_folder_has_few_modules() -> None:
-    counts = Counter(path.parent.as_posix() for path in modules(*PRODUCT) if path.name != "__init__.py")
-    crowded = {folder: count for folder, count in counts.items() if count > ONE_PER_RESOURCE.get(folder, MAX_MODULES)}
-    assert crowded == {}
+def test_a_package_is_small_and_uses_few_others() -> None:
+    lines: Counter[str] = Counter()
+    dependencies: defaultdict[str, set[str]] = defaultdict(set)
+    for path in modules(*PRODUCT):
+        package = path.parent.as_posix()
+        lines[package] += len((ROOT / path).read_text().splitlines())
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in PRODUCT:
+                module = Path(*node.module.split("."))
+                dependencies[package].add((module if (ROOT / module).is_dir() else module.parent).as_posix())
+    assert {package: count for package, count in lines.items() if count > MAX_LINES} == {}
+    used = {package: sorted(others - {package}) for package, others in dependencies.items()}
+    assert {package: others for package, others in used.items() if len(others) > MAX_DEPENDENCIES} == {}
 
 
 def test_public_class_names_are_unique() -> None:
