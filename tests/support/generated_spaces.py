@@ -12,7 +12,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -516,7 +516,7 @@ def pipeline() -> Iterator[Pipeline]:
         tempfile.TemporaryDirectory() as scratch,
         warnings.catch_warnings(),
         patch.object(ONNXRegistry, "from_torchlib", operators),
-        patch.multiple(parity, TARGET_OBSERVATIONS=64, MIN_OBSERVATIONS=64),
+        patch.multiple(parity, EXPORTED=replace(parity.EXPORTED, observations=64), MIN_OBSERVATIONS=64),
         patch.object(gymnasium.logger, "min_level", gymnasium.logger.ERROR),
         closing(Pipeline(Path(scratch))) as line,
     ):

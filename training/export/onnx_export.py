@@ -32,7 +32,8 @@ class PolicyGraph(nn.Module):
         self.module = module
         self.observed = observed
         self.remembered = tuple(module.get_initial_state())
-        self.to_environment = _to_environment(action)
+        assert isinstance(action, Discrete | MultiDiscrete | Box), "module_spec refuses others"
+        self.to_environment = ContinuousActions(action) if isinstance(action, Box) else IntegerActions(action)
 
     def forward(self, *arrays: Tensor) -> tuple[Tensor, ...]:
         batch = {
@@ -145,13 +146,6 @@ def state_names(keys: Iterable[str], prefix: str = STATE_IN) -> list[str]:
         prefix + (LAST_ACTION.removeprefix(STATE_IN) if key == PREVIOUS_ACTION else str(i))
         for i, key in enumerate(keys)
     ]
-
-
-def _to_environment(space: Space) -> nn.Module:
-    if isinstance(space, Box):
-        return ContinuousActions(space)
-    assert isinstance(space, Discrete | MultiDiscrete), "module_spec refuses it"
-    return IntegerActions(space)
 
 
 def _dtype(name: str) -> torch.dtype:

@@ -2,8 +2,8 @@
 
 import itertools
 import time
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,13 +30,7 @@ from training.sampling.env_runner import one_thread
 from training.sampling.recurrent_state import RecurrentStates
 from training.sampling.reset_seeds import SEEDS
 
-TARGET_OBSERVATIONS = 2048
-"""Observations per policy for the comparison."""
-MAX_MEGABYTES = 128
-"""Large observations are limited to this size, but not below MIN_OBSERVATIONS."""
 MIN_OBSERVATIONS = 256
-ENOUGH_SECONDS, MOST_SECONDS = 8.0, 120.0
-"""Seconds of play after which MIN_OBSERVATIONS suffice, and after which a policy with fewer has failed."""
 NUM_ENVS = 8
 TOLERANCE = 1e-3
 """Maximum difference of distribution inputs and states, relative to 1 + |x|: above it, exploration would differ."""
@@ -45,10 +39,31 @@ PROBES, MAX_PROBE_BYTES = 32, 2**20
 
 
 @dataclass(frozen=True, slots=True)
+class PlayLimits:
+    """How much is played for a check.
+
+    Attributes:
+        observations: Of each policy.
+        megabytes: Large observations are limited to this size, but not below MIN_OBSERVATIONS.
+        enough_seconds: Seconds of play after which MIN_OBSERVATIONS suffice.
+        most_seconds: Seconds after which a policy with fewer has failed.
+    """
+
+    observations: int
+    megabytes: int
+    enough_seconds: float
+    most_seconds: float
+
+
+EXPORTED = PlayLimits(observations=2048, megabytes=128, enough_seconds=8.0, most_seconds=120.0)
+
+
+@dataclass(frozen=True, slots=True)
 class ObservedBatch:
     """k observations of a policy, and the recurrent states before them.
 
-    observations: ONNX input name → (k, …). state: key → (k, width), with the module's keys; empty if not recurrent.
+    observations: ONNX input name → (k, …). state: key → (k, width), with the keys of the module or of an imported
+    graph; empty if not recurrent.
     """
 
     observations: dict[str, NDArray]
@@ -58,56 +73,100 @@ class ObservedBatch:
         return len(next(iter(self.observations.values())))
 
 
-@one_thread()
-def collect_observations(
-    environment: EnvironmentConfig, interface: Interface, modules: Mapping[str, PolicyModule], seed: int
+Acting = Callable[[str, ObservedBatch, bool], tuple[NDArray, Mapping[str, NDArray]]]
+"""Policy id, its observations, and whether it plays or random actions are taken → actions in the environment's space,
+and the states after."""
+
+
+def observed_play(
+    environment: EnvironmentConfig,
+    interface: Interface,
+    initial_states: Mapping[str, Mapping[str, NDArray]],
+    act: Acting,
+    limits: PlayLimits,
+    seeds: Iterator[int],
 ) -> dict[str, list[ObservedBatch]]:
     """Play until each policy has enough observations; return policy → batches of them, with recurrent states.
 
-    Every other environment samples from the modules' distributions, and the rest plays at random, to include
-    observations that the policies do and do not reach. Raises ParityError if a policy does not act often enough.
+    In every other environment the policies play, in the rest random actions are taken, to include observations that the
+    policies do and do not reach.
+
+    Args:
+        environment: Played in NUM_ENVS stock environments.
+        interface: Of the environment.
+        initial_states: Policy id → key → (width,); empty if not recurrent.
+        act: Chooses the actions.
+        limits: How much is played.
+        seeds: Of the episodes.
+
+    Raises:
+        ParityError: A policy does not act often enough. What `act` raises.
     """
-    rng = generator(seed, "parity")
-    batched = stock_stepping(environment, NUM_ENVS)
-    resets = itertools.count()
     policies = interface.policy_ids
-    # Group 2 i is policy i at random, group 2 i + 1 the same exploring.
-    groups = 2 * np.array([policies.index(interface.policies[agent]) for agent in batched.agents])
-    recurrent_states = {
-        policy: RecurrentStates(module.get_initial_state(), NUM_ENVS, len(batched.agents))
-        for policy, module in modules.items()
-    }
-    distributions = {policy: distribution(interface.of_policy(policy).action) for policy in modules}
-    met: dict[str, list[ObservedBatch]] = defaultdict(list)
+    batches: dict[str, list[ObservedBatch]] = {policy: [] for policy in policies}
     began = time.monotonic()
+    with closing(stock_stepping(environment, NUM_ENVS)) as batched:
+        # Group 2 i is policy i at random, group 2 i + 1 the policy itself.
+        groups = 2 * np.array([policies.index(interface.policies[agent]) for agent in batched.agents])
+        recurrent_states = {
+            policy: RecurrentStates(state, NUM_ENVS, len(batched.agents)) for policy, state in initial_states.items()
+        }
 
-    def next_episodes(envs: Indices) -> Starts:
-        seeds = [derive(seed, "parity", next(resets)) % SEEDS for _ in envs]
-        return Starts(envs, np.array(seeds), groups + envs[:, np.newaxis] % 2)
+        def next_episodes(envs: Indices) -> Starts:
+            return Starts(envs, np.array([next(seeds) for _ in envs]), groups + envs[:, np.newaxis] % 2)
 
-    try:
         turn = batched.start(next_episodes)
-        while not _is_enough(met, interface, time.monotonic() - began):
+        while not _is_enough(batches, limits, time.monotonic() - began):
             for states in recurrent_states.values():
                 states.forget(turn.finished)
             actions = {}
             for group, batch in turn.batches.items():
-                policy, explores = policies[group // 2], group % 2
-                states = recurrent_states[policy]
-                situation = ObservedBatch(batch.observations, states.get(batch))
-                met[policy].append(situation)
-                dist_inputs, state = module_outputs(modules[policy], situation)
-                states.update(batch, state)
-                drawn = distributions[policy]
-                if explores:
-                    raw, _ = drawn.sample(dist_inputs, rng)
-                else:
-                    raw, _ = drawn.uniform(batch.observations.get(ACTION_MASK), len(situation), rng)
-                actions[group] = to_environment(raw, interface.of_policy(policy).action)
+                policy = policies[group // 2]
+                observed = ObservedBatch(batch.observations, recurrent_states[policy].get(batch))
+                batches[policy].append(observed)
+                actions[group], after = act(policy, observed, bool(group % 2))
+                recurrent_states[policy].update(batch, after)
             turn = batched.step(actions)
-    finally:
-        batched.close()
-    return dict(met)
+    return batches
+
+
+def _is_enough(batches: Mapping[str, list[ObservedBatch]], limits: PlayLimits, seconds: float) -> bool:
+    counts = {policy: sum(map(len, observed)) for policy, observed in batches.items()}
+    if seconds > limits.most_seconds and (least := min(counts.values())) < MIN_OBSERVATIONS:
+        rarest = min(counts, key=lambda policy: counts[policy])
+        raise ParityError(
+            f"policy {rarest} received {least} observations in {seconds:.0f} s of play, expected {MIN_OBSERVATIONS}"
+        )
+    for policy, observed in batches.items():
+        target = MIN_OBSERVATIONS
+        if observed and seconds <= limits.enough_seconds:
+            size = sum(array[0].nbytes for array in observed[0].observations.values())
+            target = min(limits.observations, max(MIN_OBSERVATIONS, limits.megabytes * 2**20 // size))
+        if counts[policy] < target:
+            return False
+    return True
+
+
+@one_thread()
+def collect_observations(
+    environment: EnvironmentConfig, interface: Interface, modules: Mapping[str, PolicyModule], seed: int
+) -> dict[str, list[ObservedBatch]]:
+    """Return what `observed_play` returns, where modules sample from their distributions. Raises ParityError."""
+    rng = generator(seed, "parity")
+    actions = {policy: interface.of_policy(policy).action for policy in modules}
+    distributions = {policy: distribution(space) for policy, space in actions.items()}
+
+    def act(policy: str, observed: ObservedBatch, plays: bool) -> tuple[NDArray, Mapping[str, NDArray]]:
+        dist_inputs, state = module_outputs(modules[policy], observed)
+        if plays:
+            raw, _ = distributions[policy].sample(dist_inputs, rng)
+        else:
+            raw, _ = distributions[policy].uniform(observed.observations.get(ACTION_MASK), len(observed), rng)
+        return to_environment(raw, actions[policy]), state
+
+    initial_states = {policy: module.get_initial_state() for policy, module in modules.items()}
+    seeds = (derive(seed, "parity", reset) % SEEDS for reset in itertools.count())
+    return observed_play(environment, interface, initial_states, act, EXPORTED, seeds)
 
 
 @one_thread()
@@ -151,18 +210,18 @@ def check_parity(path: Path, policy: str, module: PolicyModule, batches: list[Ob
     return Parity(observations=count, mismatches=mismatches, near_ties=near_ties, max_difference=largest)
 
 
-def probes(path: Path, batches: list[ObservedBatch]) -> Probes:
-    """Return evenly spaced observations with the actions of the graph at `path`."""
+def probes(graph: OnnxPolicy, batches: list[ObservedBatch]) -> Probes:
+    """Return evenly spaced observations with the actions of a graph."""
     starts = np.cumsum([0, *map(len, batches)])
     size = sum(array[0].nbytes for array in batches[0].observations.values())
     count = min(PROBES, max(1, MAX_PROBE_BYTES // size), int(starts[-1]))
     rows = np.linspace(0, starts[-1] - 1, count).astype(int)
     samples = [(batches[i], row - starts[i]) for row in rows for i in [int(np.searchsorted(starts, row, "right")) - 1]]
     observations = {
-        name: np.stack([met.observations[name][row] for met, row in samples]) for name in batches[0].observations
+        name: np.stack([batch.observations[name][row] for batch, row in samples]) for name in batches[0].observations
     }
-    state = _state_in({key: np.stack([met.state[key][row] for met, row in samples]) for key in batches[0].state})
-    return Probes(observations, state, OnnxPolicy(path).act(observations, state=state or None).actions)
+    state = _state_in({key: np.stack([batch.state[key][row] for batch, row in samples]) for key in batches[0].state})
+    return Probes(observations, state, graph.act(observations, state=state or None).actions)
 
 
 def _state_in(state: Mapping[str, NDArray]) -> dict[str, NDArray]:
@@ -180,28 +239,6 @@ def module_outputs(module: PolicyModule, situation: ObservedBatch) -> tuple[NDAr
     )
     state = {key: value.numpy() for key, value in outputs.get(Columns.STATE_OUT, {}).items()}
     return outputs[Columns.ACTION_DIST_INPUTS].numpy(), state
-
-
-def _is_enough(met: Mapping[str, list[ObservedBatch]], interface: Interface, seconds: float) -> bool:
-    lacking = {policy: _wanted(met[policy], seconds) - _count(met[policy]) for policy in interface.policy_ids}
-    rarest = max(lacking, key=lambda policy: lacking[policy])
-    if lacking[rarest] > 0 and seconds > MOST_SECONDS:
-        raise ParityError(
-            f"policy {rarest} received {_count(met[rarest])} observations in {seconds:.0f} s of play, "
-            f"expected {MIN_OBSERVATIONS}"
-        )
-    return lacking[rarest] <= 0
-
-
-def _wanted(batches: list[ObservedBatch], seconds: float) -> int:
-    if not batches or seconds > ENOUGH_SECONDS:
-        return MIN_OBSERVATIONS
-    size = sum(array[0].nbytes for array in batches[0].observations.values())
-    return min(TARGET_OBSERVATIONS, max(MIN_OBSERVATIONS, MAX_MEGABYTES * 2**20 // size))
-
-
-def _count(batches: list[ObservedBatch]) -> int:
-    return sum(map(len, batches))
 
 
 def count_differences(actions: NDArray, expected: NDArray, dist_inputs: NDArray, space: Space) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT
 
 from league.config.league import LeagueConfig
 from league.interface import Interface
+from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, PROBES, TRAINING, Manifest, PolicyManifest
 from league.registry.storage.rows import VersionRow
@@ -54,10 +55,24 @@ def publish(
     def build(staging: Path, number: int) -> Manifest:
         modules = load_modules(checkpoint.path, config, interface)
         observations = parity.collect_observations(config.environment, interface, modules, seed=config.training.seed)
-        policies = {
-            policy: _export(staging, policy, module, interface, observations[policy])
-            for policy, module in modules.items()
-        }
+        policies = {}
+        for policy, module in modules.items():
+            spaces, file, probes = interface.of_policy(policy), f"{policy}.onnx", f"{policy}{PROBES}"
+            export_policy(module, spaces, staging / file)
+            inputs, outputs, state = graph_tensors(module, spaces)
+            proof = parity.check_parity(staging / file, policy, module, observations[policy], spaces.action)
+            policy_probes = parity.probes(OnnxPolicy(staging / file), observations[policy])
+            (staging / probes).write_bytes(policy_probes.to_bytes())
+            policies[policy] = PolicyManifest(
+                file=file,
+                observation=spaces.observation,
+                action=spaces.action,
+                inputs=inputs,
+                outputs=outputs,
+                state=state,
+                parity=proof,
+                probes=probes,
+            )
         shutil.copytree(checkpoint.path, staging / TRAINING)
         return Manifest(
             league=config.league,
@@ -93,34 +108,13 @@ def git_commit(config_path: Path | None) -> str | None:
     if config_path is None:
         return None
     directory, name = config_path.absolute().parent, config_path.name
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(directory), *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
     try:
-        _git(directory, "ls-files", "--error-unmatch", name)
-        return _git(directory, "rev-parse", "HEAD")
+        git("ls-files", "--error-unmatch", name)
+        return git("rev-parse", "HEAD")
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def _git(directory: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(directory), *arguments]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-
-def _export(
-    staging: Path, policy: str, module: PolicyModule, interface: Interface, observations: list[parity.ObservedBatch]
-) -> PolicyManifest:
-    spaces = interface.of_policy(policy)
-    file, probes = f"{policy}.onnx", f"{policy}{PROBES}"
-    export_policy(module, spaces, staging / file)
-    inputs, outputs, state = graph_tensors(module, spaces)
-    proof = parity.check_parity(staging / file, policy, module, observations, spaces.action)
-    (staging / probes).write_bytes(parity.probes(staging / file, observations).to_bytes())
-    return PolicyManifest(
-        file=file,
-        observation=spaces.observation,
-        action=spaces.action,
-        inputs=inputs,
-        outputs=outputs,
-        state=state,
-        parity=proof,
-        probes=probes,
-    )

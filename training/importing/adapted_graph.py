@@ -34,7 +34,15 @@ def adapt(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface,
     check(model, mapping, spaces, source)
     action = spaces.action
     assert not isinstance(action, DictSpace), "check refuses it"
-    builder = _Builder(_upgraded(model, source))
+    # The added nodes are defined in OPSET.
+    current = next((opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")), OPSET)
+    try:
+        upgraded = model if current >= OPSET else version_converter.convert_version(model, OPSET)
+    except Exception as error:
+        raise EnvironmentMismatch(
+            f"{source}: opset {current} cannot be converted to {OPSET}: {one_line(error)}"
+        ) from error
+    builder = _Builder(upgraded)
     model_inputs = graph_inputs(model)
     leaves = inputs(spaces.observation)
     for name, input_mapping in mapping.inputs.items():
@@ -125,7 +133,7 @@ def _check_shape(
 
 
 def _check_output(
-    found: tuple[int | None, ...], mapping: GraphMapping, spaces: AgentInterface, refuse: Callable[[str], None]
+    sizes: tuple[int | None, ...], mapping: GraphMapping, spaces: AgentInterface, refuse: Callable[[str], None]
 ) -> None:
     if isinstance(spaces.action, DictSpace):
         refuse("dict actions are not supported")
@@ -133,8 +141,8 @@ def _check_output(
     if mapping.kind not in allowed:
         refuse(f"kind: {mapping.kind} does not fit {spaces.action.type} actions, expected one of {', '.join(allowed)}")
     width = dist_inputs_size(spaces.action)
-    if mapping.kind != "action" and found not in ((width,), (None,)):
-        refuse(f"output {mapping.output} has shape {list(found)}: {mapping.kind} have [{width}]")
+    if mapping.kind != "action" and sizes not in ((width,), (None,)):
+        refuse(f"output {mapping.output} has shape {list(sizes)}: {mapping.kind} have [{width}]")
 
 
 class _Builder:
@@ -241,13 +249,11 @@ class _Builder:
         return bytes(model.SerializeToString())
 
     def _new(self, kind: str, values: list[str], **attributes: object) -> str:
-        result = f"{'fed' if self._is_before(values) else 'adapted'}/{next(self._names)}"
+        # What depends on inputs of the policy only may be an input of the graph.
+        is_before = all(not value.startswith((PREFIX, "adapted/")) for value in values)
+        result = f"{'fed' if is_before else 'adapted'}/{next(self._names)}"
         self.node(kind, values, result, **attributes)
         return result
-
-    def _is_before(self, values: list[str]) -> bool:
-        """Whether a node's result may be an input of the graph: it depends on inputs of the policy only."""
-        return all(not value.startswith((PREFIX, "adapted/")) for value in values)
 
     def _constant(self, value: object) -> str:
         array = np.asarray(value)
@@ -281,19 +287,6 @@ def _infos(described: Tensors) -> list[ValueInfoProto]:
         )
         for tensor in described
     ]
-
-
-def _upgraded(model: onnx.ModelProto, source: str) -> onnx.ModelProto:
-    """The model with at least OPSET, in which the added nodes are defined."""
-    current = next((opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")), OPSET)
-    if current >= OPSET:
-        return model
-    try:
-        return version_converter.convert_version(model, OPSET)
-    except Exception as error:
-        raise EnvironmentMismatch(
-            f"{source}: opset {current} cannot be converted to {OPSET}: {one_line(error)}"
-        ) from error
 
 
 def decoded(value: NDArray, mask: NDArray | None, mapping: GraphMapping, action: Leaf) -> NDArray:

@@ -1,100 +1,58 @@
 """Checks of an imported policy on observations from play: legality, finiteness, and parity with its source."""
 
 import itertools
-import time
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
-from league.environments.lockstep import stock_stepping
-from league.environments.stepping import Indices, Starts, legal_rows
+from league.environments.stepping import legal_rows
 from league.errors import ParityError
 from league.interface import AgentInterface, Interface
 from league.policies.onnx import OnnxPolicy
-from league.policies.probes import Probes, excused, same
+from league.policies.probes import excused, same
 from league.policies.scripted import Random
 from league.random.seeds import derive, generator
 from league.registry.storage.manifest import Parity
 from league.spaces import ACTION_MASK, DictSpace
-from training.importing.source import Original, State, known_logits
-from training.sampling.recurrent_state import RecurrentStates
+from training.export.parity import ObservedBatch, PlayLimits, observed_play
+from training.importing.source import Original, known_logits
 from training.sampling.reset_seeds import SEEDS
 
-TARGET_OBSERVATIONS = 10_000
-"""Observations per policy for the comparison."""
-MIN_OBSERVATIONS = 256
-MAX_MEGABYTES = 256
-"""Large observations are limited to this size, but not below MIN_OBSERVATIONS."""
-ENOUGH_SECONDS, MOST_SECONDS = 300.0, 600.0
-"""Seconds of play after which MIN_OBSERVATIONS suffice, and after which a policy with fewer has failed."""
-NUM_ENVS = 8
-PROBES, MAX_PROBE_BYTES = 32, 2**20
-
-
-@dataclass(frozen=True, slots=True)
-class PlayedBatch:
-    """k observations of a policy from play, with the states before them.
-
-    observations: ONNX input name → (k, …). state: of the imported graph; empty if it is not recurrent.
-    """
-
-    observations: dict[str, NDArray]
-    state: State
-
-    def __len__(self) -> int:
-        return len(next(iter(self.observations.values())))
+IMPORTED = PlayLimits(observations=10_000, megabytes=256, enough_seconds=300.0, most_seconds=600.0)
 
 
 def collect(
     environment: EnvironmentConfig, interface: Interface, policies: Mapping[str, OnnxPolicy], seed: int
-) -> dict[str, list[PlayedBatch]]:
-    """Play until each policy has enough observations, half of the environments at random, half with the policies.
+) -> dict[str, list[ObservedBatch]]:
+    """Return what `observed_play` returns, where the imported graphs play greedily.
 
     Raises ParityError if a policy does not act often enough or acts illegally.
     """
-    batched, resets, names = stock_stepping(environment, NUM_ENVS), itertools.count(), interface.policy_ids
-    groups = 2 * np.array([names.index(interface.policies[agent]) for agent in batched.agents])
-    spaces = {name: interface.of_policy(name) for name in names}
-    scripts = {name: Random(policy_spaces.observation, policy_spaces.action) for name, policy_spaces in spaces.items()}
-    recurrent = {
-        name: RecurrentStates(
-            {key: rows[0] for key, rows in policy.initial_state(1).items()}, NUM_ENVS, len(batched.agents)
-        )
-        for name, policy in policies.items()
+    spaces = {policy: interface.of_policy(policy) for policy in policies}
+    scripts = {policy: Random(agent.observation, agent.action) for policy, agent in spaces.items()}
+    rng = generator(seed, "import")
+
+    def act(policy: str, observed: ObservedBatch, plays: bool) -> tuple[NDArray, Mapping[str, NDArray]]:
+        answer = policies[policy].act(observed.observations, state=observed.state or None)
+        mask = observed.observations.get(ACTION_MASK)
+        if not (legal := legal_rows(answer.actions, spaces[policy].action, mask)).all():
+            row = int(np.flatnonzero(~legal)[0])
+            allowed = "" if mask is None else f", where action_mask is {mask[row].tolist()}"
+            raise ParityError(f"policy {policy}: action {answer.actions[row].tolist()} is illegal{allowed}")
+        drawn = answer if plays else scripts[policy].act(observed.observations, rng=[rng] * len(observed))
+        return drawn.actions, answer.state or {}
+
+    initial_states = {
+        policy: {key: rows[0] for key, rows in graph.initial_state(1).items()} for policy, graph in policies.items()
     }
-    rng, batches, began = generator(seed, "import"), defaultdict[str, list[PlayedBatch]](list), time.monotonic()
-
-    def next_episodes(envs: Indices) -> Starts:
-        seeds = [derive(seed, "import", next(resets)) % SEEDS for _ in envs]
-        return Starts(envs, np.array(seeds), groups + envs[:, np.newaxis] % 2)
-
-    try:
-        turn = batched.start(next_episodes)
-        while not _is_enough(batches, names, time.monotonic() - began):
-            for states in recurrent.values():
-                states.forget(turn.finished)
-            actions = {}
-            for group, batch in turn.batches.items():
-                name, plays = names[group // 2], group % 2
-                played = PlayedBatch(batch.observations, recurrent[name].get(batch))
-                batches[name].append(played)
-                answer = policies[name].act(played.observations, state=played.state or None)
-                recurrent[name].update(batch, answer.state or {})
-                _check_legal(name, answer.actions, spaces[name], played)
-                drawn = scripts[name].act(played.observations, rng=[rng] * len(played))
-                actions[group] = answer.actions if plays else drawn.actions
-            turn = batched.step(actions)
-    finally:
-        batched.close()
-    return dict(batches)
+    seeds = (derive(seed, "import", reset) % SEEDS for reset in itertools.count())
+    return observed_play(environment, interface, initial_states, act, IMPORTED, seeds)
 
 
 def check_parity(
-    policy: str, graph: OnnxPolicy, original: Original, batches: list[PlayedBatch], spaces: AgentInterface
+    policy: str, graph: OnnxPolicy, original: Original, batches: list[ObservedBatch], spaces: AgentInterface
 ) -> Parity:
     """Compare the greedy actions of the imported graph with those of its source.
 
@@ -121,45 +79,3 @@ def check_parity(
     if mismatches:
         raise ParityError(f"policy {policy}: {mismatches} of {count} greedy actions differ from those of the source")
     return Parity(observations=count, mismatches=0, near_ties=near_ties, max_difference=largest)
-
-
-def probes(graph: OnnxPolicy, batches: list[PlayedBatch]) -> Probes:
-    """Return evenly spaced observations with the actions of the graph."""
-    first = batches[0]
-    together = {name: np.concatenate([batch.observations[name] for batch in batches]) for name in first.observations}
-    states = {name: np.concatenate([batch.state[name] for batch in batches]) for name in first.state}
-    total = len(next(iter(together.values())))
-    size = sum(array[0].nbytes for array in together.values())
-    rows = np.linspace(0, total - 1, min(PROBES, max(1, MAX_PROBE_BYTES // size), total)).astype(int)
-    observations = {name: array[rows] for name, array in together.items()}
-    state = {name: array[rows] for name, array in states.items()}
-    return Probes(observations, state, graph.act(observations, state=state or None).actions)
-
-
-def _check_legal(policy: str, actions: NDArray, spaces: AgentInterface, played: PlayedBatch) -> None:
-    mask = played.observations.get(ACTION_MASK)
-    if not (legal := legal_rows(actions, spaces.action, mask)).all():
-        row = int(np.flatnonzero(~legal)[0])
-        allowed = "" if mask is None else f", where action_mask is {mask[row].tolist()}"
-        raise ParityError(f"policy {policy}: action {actions[row].tolist()} is illegal{allowed}")
-
-
-def _is_enough(found: Mapping[str, list[PlayedBatch]], policies: Sequence[str], seconds: float) -> bool:
-    for policy in policies:
-        batches = found.get(policy, [])
-        count = sum(map(len, batches))
-        if count < _wanted(batches, seconds):
-            if seconds > MOST_SECONDS:
-                raise ParityError(
-                    f"policy {policy} received {count} observations in {seconds:.0f} s of play, "
-                    f"expected {MIN_OBSERVATIONS}"
-                )
-            return False
-    return True
-
-
-def _wanted(batches: list[PlayedBatch], seconds: float) -> int:
-    if not batches or seconds > ENOUGH_SECONDS:
-        return MIN_OBSERVATIONS
-    size = sum(array[0].nbytes for array in batches[0].observations.values())
-    return min(TARGET_OBSERVATIONS, max(MIN_OBSERVATIONS, MAX_MEGABYTES * 2**20 // size))

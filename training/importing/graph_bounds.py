@@ -99,28 +99,36 @@ def bounded(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterfac
     _check_count(model, source)
     flat = onnx.inliner.inline_local_functions(model) if model.functions else model
     for node in flat.graph.node:
-        _check_operator(node, source)
+        where = f"{source}: {_described(node)}"
+        if node.domain not in ("", "ai.onnx"):
+            raise InvalidInput(f"{where} is of the domain {node.domain}: only operators of ONNX itself are supported")
+        if node.op_type not in ALLOWED:
+            raise InvalidInput(
+                f"{where} is not supported: its time or memory is not bounded by the shapes of its inputs"
+            )
+        if any(attribute.type in SPARSE for attribute in node.attribute):
+            raise InvalidInput(f"{where} has a sparse tensor, which is not supported")
+        if node.op_type == "Einsum" and len(node.input) > 2:
+            raise InvalidInput(f"{where} has {len(node.input)} inputs, expected at most 2")
     if flat.graph.sparse_initializer:
         raise InvalidInput(f"{source}: sparse weights are not supported")
-    if outside := [weight.name for weight in _weights(flat) if weight.data_location == TensorProto.EXTERNAL]:
-        raise InvalidInput(f"{source}: {outside[0]} is in another file that could not be included")
-    graph, largest = _BoundedGraph(flat, _shapes(flat, mapping, spaces), source), largest_batch(spaces)
+    attributes = [attribute for node in flat.graph.node for attribute in node.attribute]
+    constants = [weight for attribute in attributes for weight in (attribute.t, *attribute.tensors)]
+    for weight in (*flat.graph.initializer, *constants):
+        if weight.data_location == TensorProto.EXTERNAL:
+            raise InvalidInput(f"{source}: {weight.name} is in another file that could not be included")
+    leaves, shapes = inputs(spaces.observation), dict[str, Shape]()
+    for name, (_, (_, *sizes)) in graph_inputs(flat).items():
+        input_mapping = mapping.inputs.get(name)
+        observed = input_mapping.shape(leaves[input_mapping.name].shape) if input_mapping is not None else ()
+        fixed_sizes = tuple(size for size in sizes if size is not None)
+        shapes[name] = fixed_sizes if len(fixed_sizes) == len(sizes) else observed
+    graph, largest = _BoundedGraph(flat, shapes, source), largest_batch(spaces)
     last, before, one = (graph.check(rows) for rows in (largest, max(1, largest - 1), 1))
     if not all(_increases(node, one, before, last) for node in flat.graph.node):
         for rows in range(2, largest - 1):
             graph.check(rows)
     return flat
-
-
-def _shapes(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface) -> dict[str, Shape]:
-    """Input → shape without the batch."""
-    leaves, shapes = inputs(spaces.observation), {}
-    for name, (_, (_, *sizes)) in graph_inputs(model).items():
-        input_mapping = mapping.inputs.get(name)
-        observed = input_mapping.shape(leaves[input_mapping.name].shape) if input_mapping is not None else ()
-        fixed_sizes = tuple(size for size in sizes if size is not None)
-        shapes[name] = fixed_sizes if len(fixed_sizes) == len(sizes) else observed
-    return shapes
 
 
 class _CheckedBatch(NamedTuple):
@@ -132,7 +140,7 @@ class _CheckedBatch(NamedTuple):
 
 
 class _BoundedGraph:
-    """The nodes of a model, with what is known about them."""
+    """The nodes of a model, with what is known about them. shapes: input → shape without the batch."""
 
     def __init__(self, model: onnx.ModelProto, shapes: Mapping[str, Shape], source: str) -> None:
         self._nodes, self._source, self._ir_version = list(model.graph.node), source, model.ir_version
@@ -163,7 +171,20 @@ class _BoundedGraph:
         for position, node in enumerate(self._nodes):
             types |= self._infer(node, types, values)
             living |= {name: _bytes(types[name]) for name in node.output if name}
-            self._check_cost(node, types, sum(living.values()), rows)
+            work, buffer = _work(node, types)
+            costs = [
+                (f"bytes of {name} {list(_shape(types[name]))}", _bytes(types[name]), MAX_TENSOR)
+                for name in node.output
+                if name
+            ]
+            # What is needed during the node or after it.
+            in_use = sum(living.values()) + 4 * buffer
+            costs += [("operations", work, MAX_OPERATIONS), ("bytes in use", in_use, MAX_MEMORY)]
+            for cost, size, most in costs:
+                if size > most:
+                    raise InvalidInput(
+                        f"{self._of(node)}: {size} {cost} for a batch of {rows} observations, expected at most {most}"
+                    )
             for name in (*node.input, *node.output):
                 if self._last_use.get(name) == position:
                     living.pop(name, None)
@@ -189,26 +210,12 @@ class _BoundedGraph:
             raise InvalidInput(f"{self._of(node)}: {one_line(error)[:200]}") from error
         for name in filter(None, node.output):
             kind = outputs[name].tensor_type if name in outputs else None
-            if kind is None or not kind.HasField("shape") or not all(_is_known(size) for size in kind.shape.dim):
+            sizes = kind.shape.dim if kind is not None and kind.HasField("shape") else [None]
+            if not all(size is not None and size.HasField("dim_value") and size.dim_value >= 0 for size in sizes):
                 raise InvalidInput(
                     f"{self._of(node)}: the size of {name} depends on values, expected that it depends on shapes only"
                 )
         return outputs
-
-    def _check_cost(self, node: NodeProto, types: Mapping[str, TypeProto], living: int, rows: int) -> None:
-        """living: bytes of all tensors that are needed during the node or after it."""
-        work, buffer = _work(node, types)
-        costs = [
-            (f"bytes of {name} {list(_shape(types[name]))}", _bytes(types[name]), MAX_TENSOR)
-            for name in node.output
-            if name
-        ]
-        costs += [("operations", work, MAX_OPERATIONS), ("bytes in use", living + 4 * buffer, MAX_MEMORY)]
-        for cost, size, most in costs:
-            if size > most:
-                raise InvalidInput(
-                    f"{self._of(node)}: {size} {cost} for a batch of {rows} observations, expected at most {most}"
-                )
 
     def _computed(
         self, position: int, node: NodeProto, types: Mapping[str, TypeProto], values: Mapping[str, NDArray]
@@ -359,25 +366,6 @@ def _check_count(model: onnx.ModelProto, source: str) -> None:
     count(model.graph.node)
 
 
-def _check_operator(node: NodeProto, source: str) -> None:
-    where = f"{source}: {_described(node)}"
-    if node.domain not in ("", "ai.onnx"):
-        raise InvalidInput(f"{where} is of the domain {node.domain}: only operators of ONNX itself are supported")
-    if node.op_type not in ALLOWED:
-        raise InvalidInput(f"{where} is not supported: its time or memory is not bounded by the shapes of its inputs")
-    if any(attribute.type in SPARSE for attribute in node.attribute):
-        raise InvalidInput(f"{where} has a sparse tensor, which is not supported")
-    if node.op_type == "Einsum" and len(node.input) > 2:
-        raise InvalidInput(f"{where} has {len(node.input)} inputs, expected at most 2")
-
-
-def _weights(model: onnx.ModelProto) -> Iterable[TensorProto]:
-    yield from model.graph.initializer
-    for node in model.graph.node:
-        for attribute in node.attribute:
-            yield from (attribute.t, *attribute.tensors)
-
-
 def _attribute(node: NodeProto, name: str) -> Any:
     return next((helper.get_attribute_value(attribute) for attribute in node.attribute if attribute.name == name), None)
 
@@ -395,7 +383,3 @@ def _shape(kind: TypeProto) -> Shape:
 def _bytes(kind: TypeProto) -> int:
     dtype = helper.tensor_dtype_to_np_dtype(kind.tensor_type.elem_type)
     return prod(_shape(kind)) * np.dtype(dtype).itemsize
-
-
-def _is_known(size: onnx.TensorShapeProto.Dimension) -> bool:
-    return size.HasField("dim_value") and size.dim_value >= 0

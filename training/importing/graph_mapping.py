@@ -12,7 +12,7 @@ from league.config.validation_errors import describe_validation_error, describe_
 from league.errors import ConfigError, EnvironmentMismatch
 from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
-from league.spaces import ACTION_MASK, Box, DictSpace, Leaf, inputs
+from league.spaces import ACTION_MASK, Box, DictSpace, inputs
 
 Kind = Literal["logits", "values", "gaussian", "action"]
 
@@ -143,7 +143,10 @@ def _output(results: dict[str, tuple[str, Shape]], spaces: AgentInterface, sourc
     distribution: Kind = "gaussian" if isinstance(action, Box) else "logits"
     width = dist_inputs_size(action)
     floats = [name for name, (dtype, shape) in results.items() if dtype.startswith("float") and shape[1:] == (width,)]
-    finished = [name for name, (dtype, shape) in results.items() if _is_action(dtype, shape, action)]
+    numbers = "float" if isinstance(action, Box) else ("int", "uint")
+    finished = [
+        name for name, (dtype, shape) in results.items() if dtype.startswith(numbers) and shape[1:] == action.shape
+    ]
     kinds: tuple[tuple[list[str], Kind], ...] = ((floats, distribution), (finished, "action"))
     for names, kind in kinds:
         if len(names) == 1:
@@ -153,8 +156,3 @@ def _output(results: dict[str, tuple[str, Shape]], spaces: AgentInterface, sourc
         f"{source}: outputs are {outputs}: expected one float output [{width}] or one {action.dtype} action "
         f"{list(action.shape)}; use a mapping file"
     )
-
-
-def _is_action(dtype: str, shape: Shape, action: Leaf) -> bool:
-    kinds = ("float",) if isinstance(action, Box) else ("int", "uint")
-    return dtype.startswith(kinds) and shape[1:] == action.shape

@@ -12,6 +12,7 @@ from training.importing.source import Source, onnx_source
 SourceKind = Literal["rllib", "sb3"]
 SUFFIXES: dict[SourceKind | None, tuple[str, ...]] = {None: (".onnx", ".pt2"), "sb3": (".zip",), "rllib": ()}
 """Option → suffixes of the policies' files in a directory; a checkpoint is one directory for all policies."""
+FORMATS = {".onnx": "onnx", ".pt2": "torch.export"}
 NAMES = {
     "onnx": "an ONNX model",
     "torch.export": "a torch.export program",
@@ -59,8 +60,11 @@ def open_sources(
     if unknown := [policy for policy in modules or () if policy not in interface.policy_ids]:
         raise InvalidInput(f"--policy {unknown[0]}: expected one of {', '.join(interface.policy_ids)}")
     files = {policy: _file(path, policy, SUFFIXES[kind]) for policy in interface.policy_ids}
-    formats = {policy: kind or _format(file) for policy, file in files.items()}
+    formats: dict[str, str] = {}
     for policy, file in files.items():
+        if kind is None and file.suffix not in FORMATS:
+            raise ConfigError(f"{file}: expected a directory, .onnx or .pt2, or the option --rllib or --sb3")
+        formats[policy] = kind or FORMATS[file.suffix]
         if formats[policy] != "onnx" and not trust:
             name = NAMES[formats[policy]]
             raise InvalidInput(f"{file}: reading {name} runs code from it: add --trust if you trust its author")
@@ -106,13 +110,6 @@ def _file(path: Path, policy: str, suffixes: Sequence[str]) -> Path:
         if file.exists():
             return file
     raise ConfigError(f"{path}: no file {' or '.join(file.name for file in candidates)}")
-
-
-def _format(file: Path) -> str:
-    formats = {".onnx": "onnx", ".pt2": "torch.export"}
-    if file.suffix not in formats:
-        raise ConfigError(f"{file}: expected a directory, .onnx or .pt2, or the option --rllib or --sb3")
-    return formats[file.suffix]
 
 
 def _digest(path: Path, *choices: object) -> str:

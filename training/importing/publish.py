@@ -13,6 +13,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import PROBES, Manifest, PolicyManifest
 from league.registry.storage.rows import VersionRow
 from league.stack import installed
+from training.export.parity import probes
 from training.importing import checks
 from training.importing.adapted_graph import adapt, graph_tensors
 from training.importing.source import Source
@@ -89,6 +90,6 @@ def _write(
         parity = checks.check_parity(
             policy, graph, sources[policy].original, played[policy], interface.of_policy(policy)
         )
-        (staging / partial[policy]["probes"]).write_bytes(checks.probes(graph, played[policy]).to_bytes())
+        (staging / partial[policy]["probes"]).write_bytes(probes(graph, played[policy]).to_bytes())
         policies[policy] = PolicyManifest(**partial[policy], parity=parity)
     return policies

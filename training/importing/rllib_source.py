@@ -71,7 +71,9 @@ def rllib_source(path: Path, module_id: str, spaces: AgentInterface, origin: dic
         examples[ACTION_MASK] = (mask.shape, _dtype(mask.dtype))
         inputs[ACTION_MASK] = InputMapping(name=ACTION_MASK)
     graph = InferenceGraph(module, key).eval()
-    answer = module.forward_inference({Columns.OBS: _batch(examples, key)})
+    zeros = {name: torch.zeros((2, *shape), dtype=dtype) for name, (shape, dtype) in examples.items()}
+    batch = zeros[OBSERVATION] if key is None else {key: zeros[OBSERVATION], ACTION_MASK: zeros[ACTION_MASK]}
+    answer = module.forward_inference({Columns.OBS: batch})
     finished = Columns.ACTION_DIST_INPUTS not in answer
     kind: Kind = "action" if finished else "gaussian" if isinstance(spaces.action, Box) else "logits"
     mapping = GraphMapping(inputs=inputs, output=OUTPUT, kind=kind)
@@ -90,11 +92,6 @@ def _observed(space: gymnasium.Space[Any], where: str) -> tuple[str | None, gymn
         if len(parts) == 1 and isinstance(parts[0][1], gymnasium.spaces.Box):
             return parts[0]
     raise EnvironmentMismatch(f"{where}: observations are {space}: expected Box, or Dict with a Box and an action_mask")
-
-
-def _batch(examples: Examples, key: str | None) -> Any:
-    zeros = {name: torch.zeros((2, *shape), dtype=dtype) for name, (shape, dtype) in examples.items()}
-    return zeros[OBSERVATION] if key is None else {key: zeros[OBSERVATION], ACTION_MASK: zeros[ACTION_MASK]}
 
 
 def _dtype(dtype: Any) -> torch.dtype:

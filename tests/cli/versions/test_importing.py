@@ -1,6 +1,7 @@
 """`league import` and `league export`."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from training.importing import checks
 
 @pytest.fixture(autouse=True)
 def few_observations(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "TARGET_OBSERVATIONS", 300)
+    monkeypatch.setattr(checks, "IMPORTED", replace(checks.IMPORTED, observations=300))
 
 
 def test_an_imported_model_can_be_promoted(league: League, registry: Registry, tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,7 @@ Exported = tuple[Interface, ActorCritic, Path, list[ObservedBatch]]
 @pytest.fixture(autouse=True)
 def few_observations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer than for a published version. `exported` has as many as that."""
-    monkeypatch.setattr(parity, "TARGET_OBSERVATIONS", 400)
+    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, observations=400))
 
 
 @pytest.fixture(scope="module")
@@ -295,7 +296,7 @@ def test_a_graph_with_other_actions_is_rejected(name: str, tmp_path: Path) -> No
 def test_a_policy_that_rarely_acts_cannot_be_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     league = LEAGUES["counting"]
     interface_of_league, modules = modules_of(league)
-    monkeypatch.setattr(parity, "MOST_SECONDS", 0)
+    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, most_seconds=0))
     with pytest.raises(ParityError, match=r"policy policy_\d received \d+ observations in \d s of play, expected 256"):
         parity.collect_observations(league.environment, interface_of_league, modules, seed=1)
 
@@ -308,9 +309,9 @@ def test_slow_and_large_environments_are_compared_on_fewer_observations(monkeypa
         observed = parity.collect_observations(league.environment, interface_of_league, modules, seed=1)
         return [sum(map(len, observed[policy])) for policy in interface_of_league.policy_ids]
 
-    assert min(counts()) >= parity.TARGET_OBSERVATIONS
+    assert min(counts()) >= parity.EXPORTED.observations
     with monkeypatch.context() as patched:
-        patched.setattr(parity, "ENOUGH_SECONDS", -1)
+        patched.setattr(parity, "EXPORTED", replace(parity.EXPORTED, enough_seconds=-1))
         assert 256 <= min(counts()) < 300
-    monkeypatch.setattr(parity, "MAX_MEGABYTES", 0)
+    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, megabytes=0))
     assert 256 <= min(counts()) < 300

@@ -1,6 +1,7 @@
 """Importing models into a league."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import onnx
@@ -21,7 +22,7 @@ from training.runs.parent import check_network
 
 @pytest.fixture(autouse=True)
 def few_observations(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checks, "TARGET_OBSERVATIONS", 400)
+    monkeypatch.setattr(checks, "IMPORTED", replace(checks.IMPORTED, observations=400))
 
 
 @pytest.fixture
