@@ -279,11 +279,13 @@ class ReplayBuffer:
         """Return the last row and the number of steps of each return, (k,), and the discounted reward sums, float32."""
         subcolumns = [name for name in self._columns if name.startswith(REWARDS)]
         rewards = {name: self._columns[name][indices].astype(np.float32) for name in subcolumns}
+        flags = [column for name, column in self._columns.items() if name.startswith(FLAGS)]
         lasts, steps = indices.copy(), np.ones(len(indices), dtype=np.int64)
         going = np.arange(len(indices))
         for step in range(1, n_step):
             following = self._following[lasts[going]]
-            goes_on = (following != NO_ROW) & ~self._is_end(lasts[going])
+            ends = [column[lasts[going]].reshape(len(going), -1) for column in flags]
+            goes_on = (following != NO_ROW) & ~np.concatenate(ends, axis=1).any(axis=1)
             going, following = going[goes_on], following[goes_on]
             if not len(going):
                 break
@@ -292,14 +294,6 @@ class ReplayBuffer:
             lasts[going] = following
             steps[going] += 1
         return lasts, steps, rewards
-
-    def _is_end(self, indices: NDArray) -> NDArray:
-        """Return (k,) bool: whether an agent's episode ends with these rows."""
-        ends = np.zeros(len(indices), dtype=bool)
-        for name, column in self._columns.items():
-            if name.startswith(FLAGS):
-                ends |= column[indices].reshape(len(indices), -1).any(axis=1)
-        return ends
 
 
 def saved_capacity(directory: Path) -> int:

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
@@ -27,7 +28,8 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.tune.experiment import Trial
 from ray.tune.logger.tensorboardx import TBXLoggerCallback
-from torch import tensor
+
+from league.errors import ConfigError
 
 # Episodes
 
@@ -98,7 +100,7 @@ class ExactStateModule(TorchRLModule):
 
     def set_state(self, state: dict[str, NDArray]) -> None:
         """Load what `get_state` returned."""
-        self.load_state_dict({name: tensor(array) for name, array in state.items()})
+        self.load_state_dict({name: torch.tensor(array) for name, array in state.items()})
 
 
 class FixedPoliciesLearner(TorchLearner):
@@ -112,6 +114,14 @@ class FixedPoliciesLearner(TorchLearner):
     @weights_version.setter
     def weights_version(self, number: int) -> None:
         self._weights_seq_no = number
+
+    def build(self) -> None:
+        """Raises ConfigError if a GPU is requested and none is available. RLlib's error does not name the setting."""
+        if self.config.num_gpus_per_learner and not torch.cuda.is_available():
+            raise ConfigError(
+                f"training.gpus: {self.config.num_gpus_per_learner:g} requested for the learner, but torch finds no GPU"
+            )
+        super().build()
 
     def configure_optimizers_for_module(self, module_id: str, config: AlgorithmConfig | None = None) -> None:
         """Raise NotImplementedError. RLlib calls this from `add_module` only."""

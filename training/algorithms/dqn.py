@@ -16,7 +16,7 @@ from league.interface import Interface
 from league.settings import Storage
 from league.spaces import Discrete
 from training.algorithms.off_policy import off_policy_config
-from training.algorithms.setup import rl_module_specs
+from training.algorithms.setup import encoder_settings, rl_module_specs
 from training.learners.dqn import DQNLearner
 from training.modules.q_network import QNetwork
 
@@ -37,11 +37,7 @@ def module_spec(settings: DQNConfig, interface: Interface) -> MultiRLModuleSpec:
                 f"policies.{policy}: dqn needs Discrete actions, got {action!r}: train it with algorithm: ppo"
             )
     atoms = settings.distributional
-    model_config = {
-        "hidden": settings.hidden,
-        "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
-        "channels": settings.channels,
-        "normalize": settings.normalize_observations,
+    model_config = encoder_settings(settings) | {
         "dueling": settings.dueling,
         "noisy": settings.noisy,
         "recurrence": settings.recurrence and settings.recurrence.width,

@@ -1,7 +1,6 @@
 """Base of all algorithms: opponents from the league, and reproducible episodes."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -9,7 +8,6 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 
 from league.config.league import LeagueConfig
-from league.config.opponents import OpponentConfig
 from league.config.schedules import ScheduleProgress
 from league.interface import Interface
 from league.random.seeds import derive
@@ -45,7 +43,12 @@ class LeagueAlgorithm(NoResultsDirectory, Algorithm):
         self.opponents.reset(steps)
         # With remote runners, the local one only holds weights.
         is_local = self.env_runner_group.num_remote_env_runners() == 0
-        reset = partial(_reset_episodes, steps=steps, opponents=self.opponents.active)
+        opponents = self.opponents.active
+
+        def reset(runner: BatchedEnvRunner) -> None:
+            runner.exchange_opponents(opponents)
+            runner.reset_episodes(steps)
+
         self.env_runner_group.foreach_env_runner(reset, local_env_runner=is_local)
         torch.manual_seed(derive(self.config.seed or 0, "learner", steps))
 
@@ -68,8 +71,3 @@ class LeagueAlgorithm(NoResultsDirectory, Algorithm):
         super().set_state(state)
         if OPPONENTS in state:
             self.opponents.set_state(state[OPPONENTS])
-
-
-def _reset_episodes(runner: BatchedEnvRunner, steps: int, opponents: Sequence[OpponentConfig]) -> None:
-    runner.exchange_opponents(opponents)
-    runner.reset_episodes(steps)

@@ -17,7 +17,7 @@ from league.errors import ConfigError
 from league.interface import Interface
 from league.settings import Storage
 from training.algorithms.off_policy import OffPolicy, off_policy_config
-from training.algorithms.setup import rl_module_specs
+from training.algorithms.setup import encoder_settings, rl_module_specs
 from training.learners.maddpg import MADDPGLearner
 from training.modules.maddpg import Actor
 from training.sampling.closed_transitions import JOINT
@@ -66,10 +66,4 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
 
 def module_spec(settings: MADDPGConfig, interface: Interface) -> MultiRLModuleSpec:
     """Return the actors of all policies. Raises ConfigError for unsupported spaces."""
-    model_config = {
-        "hidden": settings.hidden,
-        "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
-        "channels": settings.channels,
-        "normalize": settings.normalize_observations,
-    }
-    return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, Actor, model_config))
+    return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, Actor, encoder_settings(settings)))

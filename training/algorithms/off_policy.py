@@ -17,7 +17,7 @@ randomness from the seed and the number of steps so far.
 """
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,6 @@ from ray.rllib.utils.metrics import (
 
 from league.config.league import LeagueConfig
 from league.config.off_policy import OffPolicyConfig, QLearningConfig
-from league.config.opponents import OpponentConfig
 from league.config.training import TrainingSettings
 from league.interface import Interface
 from league.random.seeds import derive
@@ -47,7 +46,7 @@ from training.algorithms.league_algorithm import LeagueAlgorithm
 from training.algorithms.metrics import EXPLORATION
 from training.algorithms.setup import configure
 from training.learners.off_policy import OffPolicyLearner
-from training.replay_buffer import ReplayBuffer, Sample, TransitionBlock, saved_capacity
+from training.replay_buffer import ReplayBuffer, Sample, saved_capacity
 from training.rllib_compat import ExplicitConfig, local_learner
 from training.sampling.closed_transitions import JOINT
 from training.sampling.env_runner import LEAGUE
@@ -98,7 +97,7 @@ class OffPolicy(LeagueAlgorithm):
             self.metrics.log_value((TIMERS, timer), value, window=1)
         self.metrics.log_value(EXPLORATION, self.exploration, window=1)
         is_local = self.env_runner_group.num_remote_env_runners() == 0
-        results = self.env_runner_group.foreach_env_runner(_metrics, local_env_runner=is_local)
+        results = self.env_runner_group.foreach_env_runner(ReplayRunner.get_metrics, local_env_runner=is_local)
         self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
         self.exchange_opponents(results, self.steps - before)
         if learned := self._learner.results():
@@ -149,7 +148,7 @@ class OffPolicy(LeagueAlgorithm):
         group = self.env_runner_group
         remote = group.num_remote_env_runners()
         play = partial(
-            _play_round,
+            ReplayRunner.transitions,
             actions=-(-self.settings.update_every // max(remote, 1)),
             exploration=self.exploration,
             opponents=self.opponents.active,
@@ -215,14 +214,3 @@ def starts_with_empty_replay(settings: TrainingSettings, checkpoint: Path) -> bo
         return False
     capacities = {saved_capacity(directory) for directory in (checkpoint / REPLAY).glob("*")}
     return not settings.replay_in_checkpoint or capacities != {settings.replay_capacity}
-
-
-def _play_round(
-    runner: ReplayRunner, actions: int, exploration: float, opponents: Sequence[OpponentConfig]
-) -> tuple[int, dict[str, TransitionBlock]]:
-    runner.exchange_opponents(opponents)
-    return runner.transitions(actions, exploration)
-
-
-def _metrics(runner: ReplayRunner) -> dict[str, Any]:
-    return runner.get_metrics()

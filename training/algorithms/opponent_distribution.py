@@ -35,7 +35,21 @@ def opponent_distribution(settings: LeagueOpponentsConfig, scores: ArrayLike, pa
     x = known(scores)
     if not len(x):
         return x
-    drawn = _base(settings, x, known(payoff))
+    uniform, payoffs = np.full(len(x), 1 / len(x)), known(payoff)
+    # Scores of a pair add up to 1, with ½ on the diagonal.
+    table = (payoffs + 1 - payoffs.T) / 2
+    match settings.sampling:
+        case "latest":
+            drawn = np.eye(len(x))[-1]
+        case "uniform":
+            drawn = uniform
+        case "pfsp":
+            weights = pfsp_weights(x, settings.weighting, settings.power)
+            drawn = weights / weights.sum() if weights.sum() > 0 else uniform
+        case "nash":
+            drawn = nash_averaging(2 * table - 1)[0]
+        case "alpha_rank":
+            drawn = alpha_rank(table) if len(x) > 1 else uniform
     forgotten = x < FORGOTTEN_BELOW
     if not forgotten.any():
         return drawn
@@ -67,26 +81,3 @@ def systematic_counts(probabilities: Floats, draws: int, rng: np.random.Generato
 def known(scores: ArrayLike) -> Floats:
     """Return scores with ½ in place of NaN."""
     return np.nan_to_num(np.asarray(scores, dtype=np.float64), nan=UNKNOWN)
-
-
-def _base(settings: LeagueOpponentsConfig, x: Floats, payoff: Floats) -> Floats:
-    uniform = np.full(len(x), 1 / len(x))
-    match settings.sampling:
-        case "latest":
-            return np.eye(len(x))[-1]
-        case "uniform":
-            return uniform
-        case "pfsp":
-            weights = pfsp_weights(x, settings.weighting, settings.power)
-            total = weights.sum()
-            return weights / total if total > 0 else uniform
-        case "nash":
-            table = _antisymmetric(payoff)
-            return nash_averaging(2 * table - 1)[0]
-        case "alpha_rank":
-            return alpha_rank(_antisymmetric(payoff)) if len(x) > 1 else uniform
-
-
-def _antisymmetric(payoff: Floats) -> Floats:
-    """Return the payoff matrix with scores of a pair that add up to 1, and ½ on the diagonal."""
-    return (payoff + 1 - payoff.T) / 2

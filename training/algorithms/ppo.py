@@ -8,7 +8,7 @@ keeps the policy gradient valid (Huang and Ontañón, 2020, arXiv 2006.14171). A
 estimates (Schulman et al., 2016, arXiv 1506.02438).
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -33,7 +33,7 @@ from league.settings import Storage
 from league.spaces import ACTION_MASK, inputs
 from training.algorithms import setup
 from training.algorithms.league_algorithm import LeagueAlgorithm
-from training.algorithms.setup import configure, rl_module_specs
+from training.algorithms.setup import configure, encoder_settings, rl_module_specs
 from training.learners.magnet import check_magnet
 from training.learners.ppo import PPOLearner, hyperparameters
 from training.learners.teacher import check_teacher
@@ -50,10 +50,11 @@ class PPO(LeagueAlgorithm, ppo.PPO):
         with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
             chunks, results = self.sample_train_batch()
             self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
+        settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
         with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
             learned = self.learner_group.update(
                 episodes=chunks,
-                policies=self._learning(),
+                policies=setup.learning_policies(settings, tuple(self.config.policies), self.iteration),
                 progress=self.progress,
                 num_epochs=self.config.num_epochs,
                 minibatch_size=self.config.minibatch_size,
@@ -81,10 +82,6 @@ class PPO(LeagueAlgorithm, ppo.PPO):
                 chunks += runner_chunks
                 results.append(metrics)
         return chunks, results
-
-    def _learning(self) -> Collection[str]:
-        settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
-        return setup.learning_policies(settings, tuple(self.config.policies), self.iteration)
 
 
 def _sample_chunks(
@@ -129,34 +126,28 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
 
 
 def module_spec(settings: PPOConfig, interface: Interface) -> MultiRLModuleSpec:
-    """Return the modules of all policies. Raises ConfigError for unsupported spaces."""
-    model_config = {
-        "hidden": settings.hidden,
-        "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
-        "channels": settings.channels,
-        "recurrence": settings.recurrence and settings.recurrence.width,
-        "normalize": settings.normalize_observations,
-    }
+    """Return the modules of all policies.
+
+    Raises ConfigError for unsupported spaces, or a shared encoder of different observation spaces.
+    """
+    model_config = encoder_settings(settings) | {"recurrence": settings.recurrence and settings.recurrence.width}
     if settings.shared_encoder:
-        _check_shared(interface)
+        observed = {
+            policy: {
+                name: leaf
+                for name, leaf in inputs(interface.of_policy(policy).observation).items()
+                if name != ACTION_MASK
+            }
+            for policy in interface.policy_ids
+        }
+        first, *other_policies = observed
+        for other in other_policies:
+            if observed[other] != observed[first]:
+                raise ConfigError(
+                    f"training.shared_encoder: policies {first} and {other} have different observation spaces: remove"
+                    " it, or pad the observations with SuperSuit"
+                )
     return MultiRLModuleSpec(
         multi_rl_module_class=SharedEncoder if settings.shared_encoder else MultiRLModule,
         rl_module_specs=rl_module_specs(interface, ActorCritic, model_config),
     )
-
-
-def _check_shared(interface: Interface) -> None:
-    """Raise ConfigError unless all policies have the same observation space, action masks aside."""
-    observed = {
-        policy: {
-            name: leaf for name, leaf in inputs(interface.of_policy(policy).observation).items() if name != ACTION_MASK
-        }
-        for policy in interface.policy_ids
-    }
-    first, *other_policies = observed
-    for other in other_policies:
-        if observed[other] != observed[first]:
-            raise ConfigError(
-                f"training.shared_encoder: policies {first} and {other} have different observation spaces: remove it,"
-                " or pad the observations with SuperSuit"
-            )

@@ -14,7 +14,7 @@ from league.config.off_policy import QMIXConfig
 from league.interface import Interface
 from league.settings import Storage
 from training.algorithms.off_policy import off_policy_config
-from training.algorithms.setup import rl_module_specs
+from training.algorithms.setup import encoder_settings, rl_module_specs
 from training.learners.qmix import QMIXLearner, teams
 from training.modules.qmix import AgentNetwork
 from training.sampling.replay_runner import JointRunner
@@ -36,11 +36,5 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
 def module_spec(settings: QMIXConfig, interface: Interface) -> MultiRLModuleSpec:
     """Return the modules of all policies. Raises ConfigError for agents that cannot be mixed."""
     teams(settings.groups, interface)
-    model_config = {
-        "hidden": settings.hidden,
-        "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
-        "channels": settings.channels,
-        "normalize": settings.normalize_observations,
-        "recurrence": settings.recurrence and settings.recurrence.width,
-    }
+    model_config = encoder_settings(settings) | {"recurrence": settings.recurrence and settings.recurrence.width}
     return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, AgentNetwork, model_config))

@@ -144,6 +144,16 @@ def num_envs(league: LeagueConfig, agents: int) -> int:
     return min(max(fitting, STOCK_ENVS), VECTOR_ENVS)
 
 
+def encoder_settings(settings: TrainingSettings) -> dict[str, Any]:
+    """Return the part of `model_config` that describes a module's encoder."""
+    return {
+        "hidden": settings.hidden,
+        "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
+        "channels": settings.channels,
+        "normalize": settings.normalize_observations,
+    }
+
+
 def rl_module_specs(
     interface: Interface, module: type[PolicyModule], model_config: dict[str, Any]
 ) -> dict[str, RLModuleSpec]:

@@ -38,13 +38,19 @@ class DQNLearner(OffPolicyLearner):
         network.encoder.update_statistics({name: column[counted] for name, column in observations.items()})
         hidden, after = self._hidden(network, batch.rows)
         outputs = _chosen(network.head_outputs(observations, noise=True, hidden=hidden), actions)
-        compare = self._values if network.atoms is None else self._atoms
-        errors = compare(policy, batch, outputs, after)
-        values = outputs if network.atoms is None else (outputs.detach().softmax(-1) * network.atoms).sum(-1)
+        rewards, discounts, terminated = (batch.rows[name] for name in (REWARDS, DISCOUNTS, TERMINATED))
+        with torch.no_grad():
+            following = self._following(policy, batch, after)
+            if network.atoms is None:
+                targets = bootstrapped_returns(rewards, discounts, terminated, following)
+            else:
+                targets = project_distribution(following.softmax(-1), network.atoms, rewards, discounts, terminated)
         if network.atoms is None:
+            values, errors = outputs, outputs - targets
             losses = nn.functional.smooth_l1_loss(errors, torch.zeros_like(errors), reduction="none")
         else:
-            losses = errors
+            values = (outputs.detach().softmax(-1) * network.atoms).sum(-1)
+            losses = errors = -(targets * outputs.log_softmax(-1)).sum(-1)  # cross-entropies
         return ReplayLoss(
             total=(batch.weights * losses)[counted].mean(),
             errors=errors.abs(),
@@ -67,27 +73,11 @@ class DQNLearner(OffPolicyLearner):
         with torch.no_grad():
             return hidden, network.hidden_after(subcolumns(rows, NEXT + OBSERVATIONS), actions, hidden)
 
-    def _values(self, policy: str, batch: ReplayBatch, taken: Tensor, after: Tensor | None) -> Tensor:
-        """Return the temporal differences, (k,). after: hidden states at the next observations."""
-        with torch.no_grad():
-            rows, (best_actions, answers) = batch.rows, self._next(policy, batch, after)
-            targets = bootstrapped_returns(
-                rows[REWARDS], rows[DISCOUNTS], rows[TERMINATED], _chosen(answers, best_actions)
-            )
-        return taken - targets
+    def _following(self, policy: str, batch: ReplayBatch, after: Tensor | None) -> Tensor:
+        """Return the target network's outputs for the next actions: values (k,), or logits (k, atoms).
 
-    def _atoms(self, policy: str, batch: ReplayBatch, taken: Tensor, after: Tensor | None) -> Tensor:
-        """Return the cross-entropies between the projected target distribution and the network's, (k,)."""
-        network, rows = self.networks[policy], batch.rows
-        assert isinstance(network, QNetwork)
-        with torch.no_grad():
-            best_actions, answers = self._next(policy, batch, after)
-            following = _chosen(answers, best_actions).softmax(-1)
-            targets = project_distribution(following, network.atoms, rows[REWARDS], rows[DISCOUNTS], rows[TERMINATED])
-        return -(targets * taken.log_softmax(-1)).sum(-1)
-
-    def _next(self, policy: str, batch: ReplayBatch, after: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return the next actions, (k,), and the target network's outputs."""
+        after: hidden states at the next observations.
+        """
         network, target = self.networks[policy], self.targets[policy]
         assert isinstance(network, QNetwork)
         assert isinstance(target, QNetwork)
@@ -97,12 +87,9 @@ class DQNLearner(OffPolicyLearner):
         online = None
         if self.settings.double:
             online = network.expected(network.head_outputs(observations, noise=True, hidden=after))
-        return next_actions(online, target.expected(answers), _flat_mask(observations.get(ACTION_MASK))), answers
+        mask = observations[ACTION_MASK].flatten(1) if ACTION_MASK in observations else None
+        return _chosen(answers, next_actions(online, target.expected(answers), mask))
 
 
 def _chosen(answers: Tensor, actions: Tensor) -> Tensor:
     return answers[torch.arange(len(actions)), actions]
-
-
-def _flat_mask(mask: Tensor | None) -> Tensor | None:
-    return None if mask is None else mask.flatten(1)

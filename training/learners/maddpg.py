@@ -76,7 +76,21 @@ class MADDPGLearner(OffPolicyLearner):
         self._agents = [
             AgentSlot(policy, i) for policy in self.interface.policy_ids for i in range(by_policy.count(policy))
         ]
-        return {critic_name(policy): self._critic(AgentSlot(policy, 0)) for policy in self.interface.policy_ids}
+        layers = [(layer.filters, layer.kernel, layer.stride) for layer in self.settings.convolutions]
+        critics: dict[str, nn.Module] = {}
+        for policy in self.interface.policy_ids:
+            spaces = [
+                module_spaces(self.interface, place.policy) for place in self._critic_agents(AgentSlot(policy, 0))
+            ]
+            critics[critic_name(policy)] = Critic(
+                [observation for observation, _ in spaces],
+                [action for _, action in spaces],
+                self.settings.hidden,
+                layers,
+                self.settings.normalize_observations,
+                self.settings.channels,
+            )
+        return critics
 
     def learn(self, samples: Mapping[str, Sample], learning: Collection[str]) -> dict[str, NDArray]:
         """Update the critics and actors of `learning`. samples: policy id → its own sample of joint transitions."""
@@ -103,14 +117,15 @@ class MADDPGLearner(OffPolicyLearner):
         weights = share * batch.weights.repeat(len(order))
         targets = self._targets(policy, batch, order)
         observations, actions = self._critic_inputs(rows, order)
-        critic = self._critic_of(policy)
+        critic = self.networks[critic_name(policy)]
+        assert isinstance(critic, Critic)
         if self.settings.normalize_observations:
             self._actor_of(policy).encoder.update_statistics(observations[0])
             critic.update_statistics(observations)
         values = critic(observations, actions)
         loss = critic_loss(values, targets, weights)
         critic_norm = self.gradient_step(loss, [critic_name(policy)])[critic_name(policy)]
-        policy_loss = self._policy_loss(policy, observations, actions, share)
+        policy_loss = self.policy_loss(policy, observations, actions, share)
         norm = self.gradient_step(policy_loss, [policy])[policy]
         errors = (values.detach() - targets).abs() * present.flatten()
         self.log_statistics(
@@ -119,11 +134,15 @@ class MADDPGLearner(OffPolicyLearner):
         self.log_statistics(policy, policy_loss=policy_loss, gradient_norm=norm)
         return errors.reshape(len(order), -1).amax(0)
 
-    def _policy_loss(self, policy: str, seen: list[Observations], done: list[Tensor], share: Tensor) -> Tensor:
-        """Evaluate the actor's current actions in the first position; the other agents' actions are those of the
-        sample."""
-        action, answers = self._actor_of(policy).act(seen[0], self.settings.temperature)
-        values = self._critic_of(policy)(seen, [action, *done[1:]])
+    def policy_loss(
+        self, policy: str, observations: list[Observations], actions: list[Tensor], share: Tensor
+    ) -> Tensor:
+        """Return the actor's loss with its current actions in the first position, and the other agents' of the sample.
+
+        observations, actions: by position, see `_critic_inputs`. share: (k,), the weight of each row.
+        """
+        action, answers = self._actor_of(policy).act(observations[0], self.settings.temperature)
+        values = self.networks[critic_name(policy)](observations, [action, *actions[1:]])
         return actor_loss(values, answers, self.settings.regularization, share)
 
     @torch.no_grad()
@@ -159,27 +178,10 @@ class MADDPGLearner(OffPolicyLearner):
         assert isinstance(actor, Actor)
         return actor
 
-    def _critic_of(self, policy: str) -> Critic:
-        critic = self.networks[critic_name(policy)]
-        assert isinstance(critic, Critic)
-        return critic
-
     def _critic_agents(self, own: AgentSlot) -> list[AgentSlot]:
         if self.settings.critic == "own":
             return [own]
         return [own, *(place for place in self._agents if place != own)]
-
-    def _critic(self, own: AgentSlot) -> Critic:
-        spaces = [module_spaces(self.interface, place.policy) for place in self._critic_agents(own)]
-        layers = [(layer.filters, layer.kernel, layer.stride) for layer in self.settings.convolutions]
-        return Critic(
-            [observation for observation, _ in spaces],
-            [action for _, action in spaces],
-            self.settings.hidden,
-            layers,
-            self.settings.normalize_observations,
-            self.settings.channels,
-        )
 
 
 def _distinct(order: CriticAgents) -> Iterable[AgentSlot]:

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
 from torch import Tensor
@@ -87,16 +86,13 @@ class Version:
 
     def dist_inputs(self, policy: str, batch: TrainBatch) -> Tensor:
         """Return the inputs of ρ's action distribution at the steps of a batch, (n, d)."""
-        parts = [
-            self._rows({name: value[rows].cpu().numpy() for name, value in batch.observations.items()}, policy)
-            for rows in batch.acted.split(PASS_ROWS)
-        ]
+        parts = []
+        for rows in batch.acted.split(PASS_ROWS):
+            observations = {name: value[rows].cpu().numpy() for name, value in batch.observations.items()}
+            dist_inputs = self._policies[policy].distribution(observations).dist_inputs
+            assert dist_inputs is not None
+            parts.append(dist_inputs)
         return torch.from_numpy(np.concatenate(parts)).to(batch.dist_inputs.device)
-
-    def _rows(self, observations: dict[str, NDArray], policy: str) -> NDArray:
-        dist_inputs = self._policies[policy].distribution(observations).dist_inputs
-        assert dist_inputs is not None
-        return dist_inputs
 
 
 Magnet = Uniform | Previous | Version

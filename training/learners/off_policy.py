@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from league.config.league import LeagueConfig
 from league.config.off_policy import OffPolicyConfig
-from league.errors import ConfigError
 from league.interface import Interface
 from training.modules.policy_module import MASKED_LOGIT
 from training.replay_buffer import Sample
@@ -134,11 +133,6 @@ class OffPolicyLearner(FixedPoliciesLearner):
         return {}
 
     def build(self) -> None:
-        """Raises ConfigError if a GPU is requested and none is available."""
-        if self.config.num_gpus_per_learner and not torch.cuda.is_available():
-            raise ConfigError(
-                f"training.gpus: {self.config.num_gpus_per_learner:g} requested for the learner, but torch finds no GPU"
-            )
         settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
         assert isinstance(settings, OffPolicyConfig)
         self.settings = settings

@@ -169,11 +169,6 @@ class PPOLearner(FixedPoliciesLearner):
     """Selects the chunks whose last observation is bootstrapped from."""
 
     def build(self) -> None:
-        """Raises ConfigError if a GPU is requested and none is available."""
-        if self.config.num_gpus_per_learner and not torch.cuda.is_available():
-            raise ConfigError(
-                f"training.gpus: {self.config.num_gpus_per_learner:g} requested for the learner, but torch finds no GPU"
-            )
         settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
         assert isinstance(settings, PPOConfig)
         self.settings = settings
@@ -236,8 +231,20 @@ class PPOLearner(FixedPoliciesLearner):
             size = minibatch_size or max(len(batch) for batch in batches.values())
             statistics: dict[str, list[Tensor]] = defaultdict(list)
             for minibatch in minibatches(batches, size=size, epochs=num_epochs):
-                for policy, row in self._gradient_step(minibatch).items():
-                    statistics[policy].append(row)
+                for parameters in self._parameters.values():
+                    for parameter in parameters:
+                        parameter.grad = None
+                answers = self.module.forward_train({policy: steps.inputs for policy, steps in minibatch.items()})
+                losses = {
+                    policy: self.compute_loss_for_module(module_id=policy, batch=steps, fwd_out=answers[policy])
+                    for policy, steps in minibatch.items()
+                }
+                torch.autograd.backward([loss.total for loss in losses.values()])
+                names = [name for name in self._parameters if name in minibatch or name == ALL_MODULES]
+                norms = {name: self._clip_and_step(name) for name in names}
+                for policy, loss in losses.items():
+                    row = torch.stack([*loss[1:-2], norms[policy], loss.magnet_kl, loss.teacher])
+                    statistics[policy].append(row.detach())
             self._log(batches, statistics)
         metrics = self.metrics.reduce()
         # RLlib reports NaN for policies that were logged earlier but not in this update.
@@ -255,8 +262,11 @@ class PPOLearner(FixedPoliciesLearner):
             if policy_chunks.policy in policies:
                 chunks[policy_chunks.policy].append(policy_chunks)
         recurrence = self.settings.recurrence
-        batches = {
-            policy: train_batch(
+        batches = {}
+        for policy, module in self.module.items():
+            if policy not in chunks:
+                continue
+            batch = train_batch(
                 module,
                 chunks[policy],
                 gamma=self.hyperparameters[policy].gamma,
@@ -264,37 +274,12 @@ class PPOLearner(FixedPoliciesLearner):
                 sequence=recurrence.sequence if recurrence else None,
                 bootstraps=self.bootstraps,
             )
-            for policy, module in self.module.items()
-            if policy in chunks
-        }
-        return {policy: self._with_references(policy, batch) for policy, batch in batches.items()}
-
-    def _with_references(self, policy: str, batch: TrainBatch) -> TrainBatch:
-        """Return a batch with what the magnet and the teacher would do."""
-        if self._magnet is not None:
-            batch = replace(batch, magnet=self._magnet.dist_inputs(policy, batch))
-        if self._teacher is not None and self._teacher_weight:
-            batch = replace(batch, taught=self._teacher.actions(policy, batch, self.weights_version))
-        return batch
-
-    def _gradient_step(self, minibatch: dict[str, Minibatch]) -> dict[str, Tensor]:
-        """Take a gradient step on the sum of the losses; return policy id → STATISTICS, MAGNET_KL and TEACHER_LOSS."""
-        for parameters in self._parameters.values():
-            for parameter in parameters:
-                parameter.grad = None
-        answers = self.module.forward_train({policy: steps.inputs for policy, steps in minibatch.items()})
-        losses = {
-            policy: self.compute_loss_for_module(module_id=policy, batch=steps, fwd_out=answers[policy])
-            for policy, steps in minibatch.items()
-        }
-        torch.autograd.backward([loss.total for loss in losses.values()])
-        norms = {
-            name: self._clip_and_step(name) for name in self._parameters if name in minibatch or name == ALL_MODULES
-        }
-        return {
-            policy: torch.stack([*loss[1:-2], norms[policy], loss.magnet_kl, loss.teacher]).detach()
-            for policy, loss in losses.items()
-        }
+            if self._magnet is not None:
+                batch = replace(batch, magnet=self._magnet.dist_inputs(policy, batch))
+            if self._teacher is not None and self._teacher_weight:
+                batch = replace(batch, taught=self._teacher.actions(policy, batch, self.weights_version))
+            batches[policy] = batch
+        return batches
 
     def compute_loss_for_module(
         self, *, module_id: str, batch: Minibatch, fwd_out: dict[str, Tensor], **_: Any

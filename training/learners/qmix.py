@@ -165,7 +165,8 @@ class QMIXLearner(OffPolicyLearner):
         for team, steps in self._steps(rows, learning).items():
             networks += [name for name in (_mixer_name(team),) if name in self.networks]
             columns = self.columns[team]
-            self._update_statistics(team, steps.states[weights > 0])
+            if isinstance(mixer := self.networks.get(_mixer_name(team)), MonotonicMixer):
+                mixer.update_statistics(steps.states[weights > 0])
             mixed = steps.mixed(self.mixer(self.networks, team), action_values[:, columns])
             with torch.no_grad():
                 targets = steps.targets(self.mixer(self.targets, team), following[:, columns])
@@ -185,7 +186,10 @@ class QMIXLearner(OffPolicyLearner):
 
     def _steps(self, rows: Mapping[str, Tensor], learning: Collection[str]) -> dict[str, TeamSteps]:
         """Return the steps of the teams with at least one learning policy."""
-        rewards, present, terminated = (self._by_agent(rows, head) for head in (REWARDS, PRESENT, TERMINATED))
+        rewards, present, terminated = (
+            torch.cat([rows[f"{head}/{policy}"] for policy in self.interface.policy_ids], dim=1)  # (k, N)
+            for head in (REWARDS, PRESENT, TERMINATED)
+        )
         policies, together = self.interface.policies, self.settings.mixer != "none"
         discounts, states, next_states = rows[DISCOUNTS], rows[STATE], rows[NEXT + STATE]
         return {
@@ -210,14 +214,6 @@ class QMIXLearner(OffPolicyLearner):
             case "vdn":
                 return vdn_mixer
         return independent_mixer
-
-    def _update_statistics(self, team: str, states: Tensor) -> None:
-        if isinstance(mixer := self.networks.get(_mixer_name(team)), MonotonicMixer):
-            mixer.update_statistics(states)
-
-    def _by_agent(self, rows: Mapping[str, Tensor], head: str) -> Tensor:
-        """(k, N)"""
-        return torch.cat([rows[f"{head}/{policy}"] for policy in self.interface.policy_ids], dim=1)
 
     def _values(self, rows: Mapping[str, Tensor], learning: Collection[str]) -> tuple[Tensor, Tensor]:
         """Return the values (k, N) of the taken actions, with gradients, and of the best next actions, without."""

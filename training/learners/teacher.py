@@ -5,23 +5,17 @@ actions: kickstarting (Schmitt et al., 2018, arXiv 1803.03835). With a weight th
 learns what the teacher knows, and then improves on it by reinforcement learning.
 """
 
-from contextlib import closing
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from league.config.ppo import TeacherConfig
 from league.errors import ConfigError, GameCrashed, one_line
 from league.interface import Interface
-from league.policies.loading import contestant
-from league.policies.policy import Policy
-from league.refs import CheckpointRef, parse_ref
-from league.registry.registry import Registry
 from league.settings import Storage
-from league.spaces import Discrete, MultiDiscrete, Space
+from league.spaces import Discrete, MultiDiscrete
 from training.learners.train_batch import PASS_ROWS, TrainBatch
+from training.sampling.opponents import policies_of
 
 
 class Teacher:
@@ -31,7 +25,7 @@ class Teacher:
         """Raises ConfigError for an unsuitable teacher, and what loading it raises."""
         self._seed, self._ref = seed, settings.ref
         self._spaces = {policy: interface.of_policy(policy).action for policy in interface.policy_ids}
-        self._policies = dict(_load(settings.ref, interface, storage).values())
+        self._policies = policies_of(settings.ref, interface, storage, "training.teacher.ref")
         for policy in self._policies.values():
             initial_state = getattr(policy, "initial_state", None)
             if initial_state is not None and initial_state(1):
@@ -48,18 +42,20 @@ class Teacher:
             update: Number of the update, from which the teacher's random choices are derived.
         """
         rng = np.random.default_rng((self._seed, update))
-        parts = [
-            self._act(policy, {name: value[rows].cpu().numpy() for name, value in batch.observations.items()}, rng)
-            for rows in batch.acted.split(PASS_ROWS)
-        ]
-        return torch.from_numpy(_raw(np.concatenate(parts), self._spaces[policy])).to(batch.acted.device)
-
-    def _act(self, policy: str, observations: dict[str, NDArray], rng: np.random.Generator) -> NDArray:
-        count = len(next(iter(observations.values())))
-        answer = self._policies[policy].act(observations, rng=[rng] * count)
-        for fault in answer.faults.values():
-            raise GameCrashed(f"training.teacher: {self._ref}: {one_line(fault, with_type=True)}") from fault
-        return answer.actions
+        parts = []
+        for rows in batch.acted.split(PASS_ROWS):
+            observations = {name: value[rows].cpu().numpy() for name, value in batch.observations.items()}
+            answer = self._policies[policy].act(observations, rng=[rng] * len(rows))
+            for fault in answer.faults.values():
+                raise GameCrashed(f"training.teacher: {self._ref}: {one_line(fault, with_type=True)}") from fault
+            parts.append(answer.actions)
+        space = self._spaces[policy]
+        assert isinstance(space, Discrete | MultiDiscrete)
+        # The inverse of `league.policies.actions.to_environment` for discrete actions.
+        raw = (np.concatenate(parts) - np.asarray(space.start)).astype(np.int64)
+        return torch.from_numpy(raw if isinstance(space, Discrete) else raw.reshape(len(raw), -1)).to(
+            batch.acted.device
+        )
 
 
 def check_teacher(interface: Interface) -> None:
@@ -67,19 +63,3 @@ def check_teacher(interface: Interface) -> None:
     for policy in interface.policy_ids:
         if not isinstance(interface.of_policy(policy).action, Discrete | MultiDiscrete):
             raise ConfigError(f"training.teacher needs discrete actions, but those of {policy} are not")
-
-
-def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:
-    if not isinstance(parse_ref(ref), CheckpointRef):
-        return contestant(ref, None, interface)
-    if storage is None:
-        raise ConfigError(f"training.teacher.ref: {ref} is a version, but no storage is given to load it from")
-    with closing(Registry.open(storage)) as registry:
-        return contestant(ref, registry, interface)
-
-
-def _raw(actions: NDArray, space: Space) -> NDArray:
-    """The inverse of `league.policies.actions.to_environment` for discrete actions."""
-    assert isinstance(space, Discrete | MultiDiscrete)
-    raw = (actions - np.asarray(space.start)).astype(np.int64)
-    return raw if isinstance(space, Discrete) else raw.reshape(len(raw), -1)

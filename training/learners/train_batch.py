@@ -193,15 +193,23 @@ def train_batch(
     lasts[np.cumsum(lengths) - 1] = True
     advantages = generalized_advantages(rewards, values, next_values, lasts, gamma, lambda_)
     targets = advantages + values
+    sequences = None
+    if sequence is not None and state:
+        # Each chunk is split into sequences of this number of steps and a remainder.
+        firsts = np.cumsum(lengths) - lengths
+        starts = np.concatenate([first + np.arange(0, n, sequence) for first, n in zip(firsts, lengths, strict=True)])
+        stops = np.append(starts[1:], lengths.sum())
+        start_states = {key: value[starts] for key, value in state.items()}
+        sequences = Sequences(column(starts), column(stops - starts), start_states)
     return TrainBatch(
         observations=observations,
         acted=column(acted),
         actions=column(np.concatenate([chunks.actions for chunks in samples])),
         dist_inputs=column(np.concatenate([chunks.dist_inputs for chunks in samples])),
         log_p=column(np.concatenate([chunks.log_p for chunks in samples])),
-        advantages=column(_standardized(advantages).astype(np.float32)),
+        advantages=column(((advantages - advantages.mean()) / max(1e-4, advantages.std())).astype(np.float32)),
         targets=column(targets.astype(np.float32)),
-        sequences=_sequences(lengths, sequence, state) if sequence is not None and state else None,
+        sequences=sequences,
         explained_variance=float(1 - advantages.var() / max(targets.var(), 1e-8)),
     )
 
@@ -239,20 +247,6 @@ def _value_pass(
         values.append(value.cpu().numpy())
         states.append(after)
     return np.concatenate(values), {key: torch.cat([after[key] for after in states]) for key in state}
-
-
-def _sequences(lengths: NDArray, sequence: int, state: dict[str, Tensor]) -> Sequences:
-    """Split each chunk into sequences of `sequence` steps and a remainder."""
-    firsts = np.cumsum(lengths) - lengths
-    starts = np.concatenate([first + np.arange(0, n, sequence) for first, n in zip(firsts, lengths, strict=True)])
-    stops = np.append(starts[1:], lengths.sum())
-    start_states = {key: value[starts] for key, value in state.items()}
-    device = next(iter(start_states.values())).device
-    return Sequences(torch.from_numpy(starts).to(device), torch.from_numpy(stops - starts).to(device), start_states)
-
-
-def _standardized(values: NDArray) -> NDArray:
-    return (values - values.mean()) / max(1e-4, values.std())
 
 
 def minibatches(batches: Mapping[str, TrainBatch], *, size: int, epochs: int) -> Iterator[dict[str, Minibatch]]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from league.spaces import ACTION_MASK
 from training.modules.distributions import TorchGaussian, torch_distribution
 from training.modules.encoder import Encoder, linear
-from training.modules.policy_module import MASKED_LOGIT, PolicyModule
+from training.modules.policy_module import PolicyModule, mask_illegal
 from training.modules.recurrent import LSTMLayer, State
 
 INITIAL_LOG_DEVIATION = -0.5
@@ -36,13 +36,7 @@ class ActorCritic(PolicyModule, ValueFunctionAPI):
     def setup(self) -> None:
         config = self.model_config
         self.distribution = torch_distribution(self.action_space)
-        self.encoder = Encoder(
-            self.observation_space,
-            config["hidden"],
-            config.get("convolutions", ()),
-            config.get("normalize", False),
-            config.get("channels"),
-        )
+        self.encoder = self.new_encoder()
         width = self.encoder.width
         self.recurrent = LSTMLayer(width, config["recurrence"]) if config.get("recurrence") else None
         if self.recurrent is not None:
@@ -74,7 +68,11 @@ class ActorCritic(PolicyModule, ValueFunctionAPI):
 
     def policy_outputs(self, embeddings: Tensor, observations: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the distribution inputs, (B, d), for encoded rows."""
-        return {Columns.ACTION_DIST_INPUTS: self._dist_inputs(embeddings, observations)}
+        answers = self.policy_head(embeddings)
+        if self.log_deviations is None:
+            return {Columns.ACTION_DIST_INPUTS: mask_illegal(answers, observations)}
+        deviations = self.log_deviations.clamp(*LOG_DEVIATION_BOUNDS).expand_as(answers)
+        return {Columns.ACTION_DIST_INPUTS: torch.cat([answers, deviations], dim=-1)}
 
     def train_outputs(self, embeddings: Tensor, observations: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the distribution inputs, (B, d), and values, (B,), for encoded rows."""
@@ -94,14 +92,6 @@ class ActorCritic(PolicyModule, ValueFunctionAPI):
     def _step(self, batch: dict[str, Any]) -> tuple[Tensor, State]:
         embeddings = self.encoder(batch[Columns.OBS])
         return (embeddings, {}) if self.recurrent is None else self.recurrent.step(embeddings, batch[Columns.STATE_IN])
-
-    def _dist_inputs(self, embeddings: Tensor, observations: dict[str, Tensor]) -> Tensor:
-        answers = self.policy_head(embeddings)
-        if self.log_deviations is not None:
-            return torch.cat([answers, self.log_deviations.clamp(*LOG_DEVIATION_BOUNDS).expand_as(answers)], dim=-1)
-        if ACTION_MASK in observations:
-            return torch.where(observations[ACTION_MASK].flatten(1).bool(), answers, MASKED_LOGIT)
-        return answers
 
 
 class SharedEncoder(MultiRLModule):

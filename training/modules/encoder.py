@@ -194,27 +194,20 @@ def _feature(
         case gymnasium.spaces.MultiBinary():
             return nn.Sequential(ToFloat(), Flat())
         case gymnasium.spaces.Box():
-            numbers = _box_feature(space, normalize)
+            low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+            with np.errstate(over="ignore"):
+                spans = high - low
+            numbers: nn.Module = ToFloat()
+            if normalize and np.issubdtype(space.dtype, np.floating):
+                numbers = RunningNormalization(space.shape)
+            elif spans.size and spans.min() >= MIN_SCALED_SPAN and spans.max() <= MAX_SCALED_SPAN:
+                # A scalar if all elements are equal.
+                scaled = (bound.flat[0] if (bound == bound.flat[0]).all() else bound for bound in (low, high))
+                numbers = UnitScale(*scaled)
             if convolutions and len(space.shape) == 3:
                 return ImageEncoder(numbers, space.shape, convolutions, channels or channels_of(space.shape))
             return nn.Sequential(numbers, Flat())
     raise ConfigError(f"training: unsupported observation space {space}")
-
-
-def _box_feature(space: gymnasium.spaces.Box, normalize: bool) -> nn.Module:
-    if normalize and np.issubdtype(space.dtype, np.floating):
-        return RunningNormalization(space.shape)
-    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    with np.errstate(over="ignore"):
-        spans = high - low
-    if spans.size and spans.min() >= MIN_SCALED_SPAN and spans.max() <= MAX_SCALED_SPAN:
-        return UnitScale(*(_scalar_if_equal(bound) for bound in (low, high)))
-    return ToFloat()
-
-
-def _scalar_if_equal(bound: np.ndarray) -> np.ndarray:
-    """Return a scalar if all elements are equal."""
-    return bound.flat[:1].reshape(()) if (bound == bound.flat[0]).all() else bound
 
 
 class Encoder(nn.Module):

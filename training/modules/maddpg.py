@@ -19,10 +19,9 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from league.config.network import Channels
-from league.spaces import ACTION_MASK
 from training.modules.distributions import TorchGaussian, torch_distribution
-from training.modules.encoder import Convolutions, Encoder, ObservationFeatures, linear
-from training.modules.policy_module import MASKED_LOGIT, PolicyModule
+from training.modules.encoder import Convolutions, ObservationFeatures, linear
+from training.modules.policy_module import PolicyModule, mask_illegal
 
 MIN_UNIFORM = torch.finfo(torch.float32).tiny
 
@@ -137,23 +136,21 @@ class Actor(PolicyModule):
 
     deviation: Tensor
     is_bounded: Tensor
+    """(m,) bool: the elements of a Box that have two bounds; empty for other spaces."""
 
     def setup(self) -> None:
-        config = self.model_config
         self.distribution = torch_distribution(self.action_space)
         self.relaxed = critic_actions(self.action_space)
-        self.encoder = Encoder(
-            self.observation_space,
-            config["hidden"],
-            config.get("convolutions", ()),
-            config.get("normalize", False),
-            config.get("channels"),
-        )
+        self.encoder = self.new_encoder()
         # Initial actions are in the middle of the bounds, where tanh is steepest, or nearly uniform.
         self.head = linear(self.encoder.width, self.distribution.outputs, gain=0.01)
         self.is_continuous = isinstance(self.distribution, TorchGaussian)
         self.register_buffer("deviation", torch.tensor(1.0))
-        self.register_buffer("is_bounded", _are_bounded(self.action_space), persistent=False)
+        is_bounded = torch.zeros(0, dtype=torch.bool)
+        if isinstance(self.action_space, gymnasium.spaces.Box):
+            finite = np.isfinite(self.action_space.low) & np.isfinite(self.action_space.high)
+            is_bounded = torch.as_tensor(np.ravel(finite))
+        self.register_buffer("is_bounded", is_bounded, persistent=False)
 
     @property
     def exploration(self) -> float:
@@ -174,9 +171,7 @@ class Actor(PolicyModule):
         if self.is_continuous:
             means = torch.where(self.is_bounded, torch.tanh(answers), answers)
             return torch.cat([means, self.deviation.log().expand_as(means)], dim=-1)
-        if ACTION_MASK in observations:
-            return torch.where(observations[ACTION_MASK].flatten(1).bool(), answers, MASKED_LOGIT)
-        return answers
+        return mask_illegal(answers, observations)
 
     def act(self, observations: dict[str, Tensor], temperature: float) -> tuple[Tensor, Tensor]:
         """Return differentiable actions in the critics' encoding, (B, width), and the head's outputs."""
@@ -186,13 +181,6 @@ class Actor(PolicyModule):
     def _forward(self, batch: dict[str, dict[str, Tensor]], **_: object) -> dict[str, Tensor]:
         observations = batch[Columns.OBS]
         return {Columns.ACTION_DIST_INPUTS: self.dist_inputs(self.head_outputs(observations), observations)}
-
-
-def _are_bounded(space: gymnasium.Space) -> Tensor:
-    """Return (m,) bool: the elements of a Box that have two bounds; empty for other spaces."""
-    if not isinstance(space, gymnasium.spaces.Box):
-        return torch.zeros(0, dtype=torch.bool)
-    return torch.as_tensor(np.ravel(np.isfinite(space.low) & np.isfinite(space.high)))
 
 
 class Critic(nn.Module):

@@ -2,8 +2,11 @@
 
 from typing import Any
 
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from league.spaces import ACTION_MASK
 from training.modules.distributions import TorchDistribution
 from training.modules.encoder import Encoder
 from training.rllib_compat import ExactStateModule
@@ -30,6 +33,17 @@ class PolicyModule(ExactStateModule):
     random action, or the noise deviation of a deterministic policy.
     """
 
+    def new_encoder(self) -> Encoder:
+        """Create the encoder that `model_config` describes: `hidden`, `convolutions`, `channels` and `normalize`."""
+        config = self.model_config
+        return Encoder(
+            self.observation_space,
+            config["hidden"],
+            config.get("convolutions", ()),
+            config.get("normalize", False),
+            config.get("channels"),
+        )
+
     def greedy_outputs(self, batch: dict[str, Any]) -> dict[str, Any]:
         """Return what the exported graph computes from `batch`."""
         return self._forward(batch)
@@ -37,3 +51,10 @@ class PolicyModule(ExactStateModule):
     def get_initial_state(self) -> dict[str, NDArray]:
         """Return the state before an episode's first step, key → (width,); empty if not recurrent."""
         return {}
+
+
+def mask_illegal(values: Tensor, observations: dict[str, Tensor]) -> Tensor:
+    """Set the logits or values (B, n) of illegal actions to MASKED_LOGIT."""
+    if ACTION_MASK not in observations:
+        return values
+    return torch.where(observations[ACTION_MASK].flatten(1).bool(), values, MASKED_LOGIT)

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from league.spaces import ACTION_MASK
 from training.modules.distributions import TorchCategorical
-from training.modules.encoder import Encoder, linear
-from training.modules.policy_module import MASKED_LOGIT, PolicyModule
+from training.modules.encoder import linear
+from training.modules.policy_module import MASKED_LOGIT, PolicyModule, mask_illegal
 from training.modules.recurrent import ActionGRULayer, State, state_after_best
 
 INITIAL_SIGMA = 0.5
@@ -34,13 +34,10 @@ class NoisyLinear(nn.Module):
         """(B, inputs) → (B, outputs). noise: draw new noise, the same for all rows."""
         if not noise:
             return nn.functional.linear(x, self.weight, self.bias)
-        incoming, outgoing = (_scaled_noise(torch.randn(size, device=x.device)) for size in (self.inputs, self.outputs))
+        draws = (torch.randn(size, device=x.device) for size in (self.inputs, self.outputs))
+        incoming, outgoing = (draw.sign() * draw.abs().sqrt() for draw in draws)
         weight = self.weight + self.weight_deviation * torch.outer(outgoing, incoming)
         return nn.functional.linear(x, weight, self.bias + self.bias_deviation * outgoing)
-
-
-def _scaled_noise(noise: Tensor) -> Tensor:
-    return noise.sign() * noise.abs().sqrt()
 
 
 class QNetwork(PolicyModule):
@@ -58,13 +55,7 @@ class QNetwork(PolicyModule):
         config = self.model_config
         self.actions = int(self.action_space.n)
         self.distribution = TorchCategorical(self.actions)
-        self.encoder = Encoder(
-            self.observation_space,
-            config["hidden"],
-            config.get("convolutions", ()),
-            config.get("normalize", False),
-            config.get("channels"),
-        )
+        self.encoder = self.new_encoder()
         self.noisy, self.dueling = bool(config.get("noisy")), bool(config.get("dueling"))
         atoms = config.get("atoms")
         self.register_buffer("atoms", torch.linspace(atoms[1], atoms[2], atoms[0]) if atoms else None, persistent=False)
@@ -146,13 +137,6 @@ class QNetwork(PolicyModule):
 
     def _answer(self, head: nn.Module, embeddings: Tensor, noise: bool) -> Tensor:
         return head(embeddings, noise) if isinstance(head, NoisyLinear) else head(embeddings)
-
-
-def mask_illegal(values: Tensor, observations: dict[str, Tensor]) -> Tensor:
-    """Set the values (B, n) of illegal actions to MASKED_LOGIT."""
-    if ACTION_MASK not in observations:
-        return values
-    return torch.where(observations[ACTION_MASK].flatten(1).bool(), values, MASKED_LOGIT)
 
 
 def legal_actions(observations: dict[str, Tensor], actions: int) -> Tensor:

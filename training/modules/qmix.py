@@ -13,9 +13,9 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from training.modules.distributions import TorchCategorical
-from training.modules.encoder import Encoder, RunningNormalization, linear
-from training.modules.policy_module import PolicyModule
-from training.modules.q_network import epsilon_greedy, mask_illegal
+from training.modules.encoder import RunningNormalization, linear
+from training.modules.policy_module import PolicyModule, mask_illegal
+from training.modules.q_network import epsilon_greedy
 from training.modules.recurrent import ActionGRULayer, state_after_best
 
 Observations = dict[str, Tensor]
@@ -36,13 +36,7 @@ class AgentNetwork(PolicyModule):
         config = self.model_config
         self.actions = int(self.action_space.n)
         self.distribution = TorchCategorical(self.actions)
-        self.encoder = Encoder(
-            self.observation_space,
-            config["hidden"],
-            config.get("convolutions", ()),
-            config.get("normalize", False),
-            config.get("channels"),
-        )
+        self.encoder = self.new_encoder()
         width = self.encoder.width
         recurrence = config.get("recurrence")
         self.recurrent = ActionGRULayer(width, self.actions, recurrence) if recurrence else None

@@ -126,20 +126,6 @@ class PolicyTransitions:
             self._open[policy].is_open[crashed_places] = False
             self._open[policy].is_first[crashed_places] = True
         closed: dict[str, list[TransitionBlock]] = {policy: [] for policy in self._policies}
-        self._close_endings(turn, closed)
-        for open_transitions in self._open.values():
-            open_transitions.places = open_transitions.places[:0]
-        for group, batch in turn.batches.items():
-            if group >= len(self._policies):
-                continue
-            policy = self._policies[group]
-            places = batch.envs * self._sizes[policy] + self._number[batch.agents]
-            rewards, unended = batch.rewards.astype(np.float32), np.zeros(len(places), dtype=bool)
-            self._close(policy, places, batch.observations, rewards, unended, unended, closed)
-            self._observe(policy, places, batch.observations)
-        return {policy: concatenate(blocks) for policy, blocks in closed.items() if blocks}
-
-    def _close_endings(self, turn: Turn, closed: dict[str, list[TransitionBlock]]) -> None:
         for rows in turn.endings:
             policies = self._policy_of[rows.agents]
             for number in np.unique(policies).tolist():
@@ -151,6 +137,25 @@ class PolicyTransitions:
                 self._close(policy, places, observations, rewards, terminated, truncated, closed)
                 self._open[policy].is_open[places] = False
                 self._open[policy].is_first[places] = True
+        for open_transitions in self._open.values():
+            open_transitions.places = open_transitions.places[:0]
+        for group, batch in turn.batches.items():
+            if group >= len(self._policies):
+                continue
+            policy = self._policies[group]
+            places = batch.envs * self._sizes[policy] + self._number[batch.agents]
+            rewards, unended = batch.rewards.astype(np.float32), np.zeros(len(places), dtype=bool)
+            self._close(policy, places, batch.observations, rewards, unended, unended, closed)
+            open_transitions = self._open[policy]
+            open_transitions.places = places
+            if not open_transitions.observations:
+                open_transitions.observations = {
+                    name: np.zeros((len(open_transitions.is_open), *column.shape[1:]), column.dtype)
+                    for name, column in batch.observations.items()
+                }
+            for name, column in batch.observations.items():
+                open_transitions.observations[name][places] = column
+        return {policy: concatenate(blocks) for policy, blocks in closed.items() if blocks}
 
     def _close(
         self,
@@ -180,17 +185,6 @@ class PolicyTransitions:
         closed[policy].append(TransitionBlock(rows, streams, open_transitions.is_first[places]))
         open_transitions.is_first[places] = False
         open_transitions.is_open[places] = False
-
-    def _observe(self, policy: str, places: NDArray, observations: Rows) -> None:
-        open_transitions = self._open[policy]
-        if not open_transitions.observations:
-            open_transitions.observations = {
-                name: np.zeros((len(open_transitions.is_open), *rows.shape[1:]), rows.dtype)
-                for name, rows in observations.items()
-            }
-        for name, rows in observations.items():
-            open_transitions.observations[name][places] = rows
-        open_transitions.places = places
 
     def sizes(self) -> dict[str, int]:
         """Return policy id → number of its agents, n_p."""
@@ -240,7 +234,10 @@ class JointTransitions:
                     " require an environment in which all agents act at once"
                 )
             self._closed.append(self._joint_rows(envs, blocks, turn))
-        self._keep_states(turn)
+        if turn.states is not None:
+            if self._states is None:
+                self._states = np.zeros((self._num_envs, turn.states.values.shape[1]), np.float32)
+            self._states[turn.states.envs] = turn.states.values
 
     def act(
         self, policy: str, raw: NDArray, log_p: NDArray, dist_inputs: NDArray, state: Mapping[str, NDArray] | None
@@ -269,25 +266,15 @@ class JointTransitions:
                 whole = np.zeros((len(envs), n, *column.shape[1:]), column.dtype)
                 whole[places] = column
                 rows["/".join(filter(None, (head, policy, tail)))] = whole
-        if self.keeps_states:
-            rows |= self._with_states(envs, rows, turn)
+        if self.keeps_states and self._states is None:
+            rows |= {STATE: _flat_state(rows, OBSERVATIONS), NEXT + STATE: _flat_state(rows, NEXT + OBSERVATIONS)}
+        elif self.keeps_states and self._states is not None:
+            after = self._states.copy()
+            for states in (turn.states, turn.last_states):
+                if states is not None:
+                    after[states.envs] = states.values
+            rows |= {STATE: self._states[envs], NEXT + STATE: after[envs]}
         return TransitionBlock(rows, self._stream_offset + envs, firsts)
-
-    def _with_states(self, envs: NDArray, rows: Rows, turn: Turn) -> Rows:
-        if self._states is None:
-            return {STATE: _flat_state(rows, OBSERVATIONS), NEXT + STATE: _flat_state(rows, NEXT + OBSERVATIONS)}
-        after = self._states.copy()
-        for states in (turn.states, turn.last_states):
-            if states is not None:
-                after[states.envs] = states.values
-        return {STATE: self._states[envs], NEXT + STATE: after[envs]}
-
-    def _keep_states(self, turn: Turn) -> None:
-        if turn.states is None:
-            return
-        if self._states is None:
-            self._states = np.zeros((self._num_envs, turn.states.values.shape[1]), np.float32)
-        self._states[turn.states.envs] = turn.states.values
 
 
 class JointTransitionsWithoutState(JointTransitions):

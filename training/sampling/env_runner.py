@@ -3,6 +3,7 @@
 import gc
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -152,7 +153,8 @@ class BatchedEnvRunner(RaisingEnvRunner):
             fragment = self.config.get_rollout_fragment_length(self.worker_index)
             num_timesteps = fragment * self.config.num_envs_per_env_runner
         explore = self.config.explore if explore is None else explore
-        forward = None if random_actions else self._forward_exploration if explore else self._forward_inference
+        compute = self.module.forward_exploration if explore else self.module.forward_inference
+        forward = None if random_actions else partial(self._forward, compute)
         play = self._play
         with self._errors_with_league(), one_thread():
             if not self._has_begun:
@@ -270,23 +272,17 @@ class BatchedEnvRunner(RaisingEnvRunner):
                 raise
             raise type(error)(name + str(error)) from error
 
-    def _forward_exploration(self, forward_inputs: Mapping[str, ForwardInput]) -> dict[str, ForwardOutput]:
-        return self._forward(self.module.forward_exploration, forward_inputs)
-
-    def _forward_inference(self, forward_inputs: Mapping[str, ForwardInput]) -> dict[str, ForwardOutput]:
-        return self._forward(self.module.forward_inference, forward_inputs)
-
     def _forward(
-        self, forward: Callable[[dict[str, Any]], dict[str, Any]], forward_inputs: Mapping[str, ForwardInput]
+        self, compute: Callable[[dict[str, Any]], dict[str, Any]], forward_inputs: Mapping[str, ForwardInput]
     ) -> dict[str, ForwardOutput]:
-        """Run one forward pass for all policies that must act."""
+        """Run one forward pass for all policies that must act. compute: of the module."""
         batch: dict[str, Any] = {}
         for policy, forward_input in forward_inputs.items():
             batch[policy] = {Columns.OBS: self._tensors(forward_input.observations)}
             if forward_input.state is not None:
                 batch[policy][Columns.STATE_IN] = self._tensors(forward_input.state)
         with torch.inference_mode():
-            outputs = forward(batch)
+            outputs = compute(batch)
         return {
             policy: ForwardOutput(
                 output[Columns.ACTION_DIST_INPUTS].cpu().numpy(),

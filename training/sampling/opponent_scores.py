@@ -8,7 +8,6 @@ reset. Unlike those of a match, the games of such a block have different seeds. 
 games are not scored: the learner never has all sides but one.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,14 +65,6 @@ class OpposedGames:
         return np.where(own_returns > self.other, 1.0, np.where(own_returns == self.other, 0.5, 0.0)).mean(axis=1)
 
 
-def _no_games(others: int) -> OpposedGames:
-    return OpposedGames(NO_ROWS, NO_ROWS, np.zeros(0), np.zeros((0, others)))
-
-
-def _concatenated(games: Sequence[OpposedGames]) -> OpposedGames:
-    return OpposedGames(*(np.concatenate([getattr(part, name) for part in games]) for name in OpposedGames.__slots__))
-
-
 def is_scored(scoring: Scoring, sides: int) -> bool:
     """Return whether training games of a league with this number of sides can be scored."""
     return scoring == "game" or (scoring == "side" and sides == 2)
@@ -92,7 +83,7 @@ class OpponentScores:
         self._sides = np.zeros(num_envs, np.int64)
         self._next_opponents, self._next_sides = self.opponents.copy(), self._sides.copy()
         self._episodes: list[Indices] = []
-        self._no_games = _no_games(max(len(sides) - 1, 1))
+        self._no_games = OpposedGames(NO_ROWS, NO_ROWS, np.zeros(0), np.zeros((0, max(len(sides) - 1, 1))))
         self._finished = [self._no_games]
 
     def begin(self, envs: Indices, opponents: Indices, sides: Indices) -> None:
@@ -122,7 +113,8 @@ class OpponentScores:
 
     def take(self, opponents: int) -> OpponentResults:
         """Return the results since the last call. opponents: the number of all opponents."""
-        games, waiting = _concatenated(self._finished), self._no_games
+        columns = ([getattr(part, name) for part in self._finished] for name in OpposedGames.__slots__)
+        games, waiting = OpposedGames(*map(np.concatenate, columns)), self._no_games
         if self._scoring == "side":
             games, waiting = games.blocks()
         numbers = np.concatenate([NO_ROWS, *self._episodes])

@@ -177,23 +177,19 @@ class Opponents:
                 self._exchanged.append(ref)
         idle = [ref for ref in self._exchanged if ref not in refs and ref not in playing]
         for ref in idle[: max(len(self._exchanged) - LOADED, 0)]:
-            self._unload(ref)
+            self._exchanged.remove(ref)
+            for policy_id in self._interface.policy_ids:
+                opponent = OpponentPolicy(ref, policy_id)
+                del self._policies[opponent]
+                self._recurrent_states.pop(opponent, None)
 
     def _load(self, ref: str) -> None:
-        loaded = dict(_load(ref, self._interface, self._storage).values())
-        for policy_id, policy in loaded.items():
+        for policy_id, policy in policies_of(ref, self._interface, self._storage, "training.opponents").items():
             opponent = OpponentPolicy(ref, policy_id)
             self._policies[opponent] = policy
             if isinstance(policy, OnnxPolicy | OpenInferencePolicy | Bot) and (initial := policy.initial_state(1)):
                 first = {key: np.asarray(rows[0], rows.dtype) for key, rows in initial.items()}
                 self._recurrent_states[opponent] = RecurrentStates(first, self._num_envs, len(self._interface.agents))
-
-    def _unload(self, ref: str) -> None:
-        self._exchanged.remove(ref)
-        for policy_id in self._interface.policy_ids:
-            opponent = OpponentPolicy(ref, policy_id)
-            del self._policies[opponent]
-            self._recurrent_states.pop(opponent, None)
 
     def act(self, opponent: OpponentPolicy, batch: Batch, rng: np.random.Generator) -> NDArray:
         """Return actions in the environment's space for the rows that an opponent controls."""
@@ -216,6 +212,19 @@ class Opponents:
             states.forget(envs)
 
 
+def policies_of(ref: str, interface: Interface, storage: Storage | None, setting: str) -> dict[str, Policy]:
+    """Return policy id → policy of a script, a bot, a remote model or a version.
+
+    Raises what loading raises, and ConfigError, which names the setting, for a version without a storage.
+    """
+    if not isinstance(parse_ref(ref), CheckpointRef):
+        return dict(contestant(ref, None, interface).values())
+    if storage is None:
+        raise ConfigError(f"{setting}: {ref} is a version, but no storage is given to load it from")
+    with closing(Registry.open(storage)) as registry:
+        return dict(contestant(ref, registry, interface).values())
+
+
 def without_mixtures(opponents: Sequence[OpponentConfig], storage: Storage | None) -> tuple[OpponentConfig, ...]:
     """Return opponents in which each mixture is replaced by its members: an episode has one of them."""
     if storage is None or not any(isinstance(parse_ref(opponent.ref), CheckpointRef) for opponent in opponents):
@@ -226,12 +235,3 @@ def without_mixtures(opponents: Sequence[OpponentConfig], storage: Storage | Non
             for opponent in opponents
             for ref, probability in players(opponent.ref, registry).items()
         )
-
-
-def _load(ref: str, interface: Interface, storage: Storage | None) -> dict[str, tuple[str, Policy]]:
-    if not isinstance(parse_ref(ref), CheckpointRef):
-        return contestant(ref, None, interface)
-    if storage is None:
-        raise ConfigError(f"training.opponents: {ref} is a version, but no storage is given to load it from")
-    with closing(Registry.open(storage)) as registry:
-        return contestant(ref, registry, interface)

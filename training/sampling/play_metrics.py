@@ -26,8 +26,7 @@ from ray.rllib.utils.metrics import (
 )
 from ray.rllib.utils.metrics.metrics_logger import MetricsLogger
 
-from league.environments.stepping import Batch, Indices, Turn
-from league.environments.vector.vector_env import AgentRows
+from league.environments.stepping import Indices, Turn
 from training.sampling.distributions import Distribution
 
 ENTROPY = "entropy"
@@ -100,38 +99,29 @@ class PlayMetrics:
             self._crashes += len(turn.crashed)
             self.forget(turn.crashed)
         for rows in turn.endings:
-            self._add_endings(rows)
+            places = rows.envs, rows.agents
+            steps = self._steps[places]
+            self._last_steps[places] += steps
+            # Agents that no policy of the league controlled are ignored.
+            self._last_returns[places] += np.where(steps > 0, self._returns[places] + rows.rewards, 0.0)
+            self._steps[places] = self._returns[places] = 0
         if len(turn.finished):
-            self._add_episodes(turn.finished)
+            self.episodes += len(turn.finished)
+            played = turn.finished[self._last_steps[turn.finished].any(axis=1)]
+            if len(played):
+                self._finished.append(
+                    PlayedEpisodes(self._lengths[played], self._last_steps[played], self._last_returns[played])
+                )
+            self.forget(turn.finished)
         for group, batch in turn.batches.items():
-            self._add_rows(batch, is_own=group < own_policies)
+            self._returns[batch.envs, batch.agents] += batch.rewards
+            if group < own_policies:
+                self._steps[batch.envs, batch.agents] += 1
 
     def forget(self, envs: Indices) -> None:
         """Drop the open episodes of some environments."""
         for column in (self._returns, self._steps, self._last_returns, self._last_steps, self._lengths):
             column[envs] = 0
-
-    def _add_rows(self, batch: Batch, is_own: bool) -> None:
-        self._returns[batch.envs, batch.agents] += batch.rewards
-        if is_own:
-            self._steps[batch.envs, batch.agents] += 1
-
-    def _add_endings(self, rows: AgentRows) -> None:
-        """Agents that no policy of the league controlled are ignored."""
-        places = rows.envs, rows.agents
-        steps = self._steps[places]
-        self._last_steps[places] += steps
-        self._last_returns[places] += np.where(steps > 0, self._returns[places] + rows.rewards, 0.0)
-        self._steps[places] = self._returns[places] = 0
-
-    def _add_episodes(self, envs: Indices) -> None:
-        self.episodes += len(envs)
-        played = envs[self._last_steps[envs].any(axis=1)]
-        if len(played):
-            self._finished.append(
-                PlayedEpisodes(self._lengths[played], self._last_steps[played], self._last_returns[played])
-            )
-        self.forget(envs)
 
     def log(self, metrics: MetricsLogger) -> None:
         """Log everything since the last call under RLlib's names."""
@@ -141,28 +131,24 @@ class PlayMetrics:
         metrics.log_value(NUM_EPISODES, episodes, reduce="sum")
         metrics.log_value(NUM_EPISODES_LIFETIME, episodes, reduce="lifetime_sum")
         metrics.log_value(CRASHES, self._crashes, reduce="sum")
-        self._log_plays(metrics)
-        if self._finished:
-            finished = PlayedEpisodes(
-                np.concatenate([played.lengths for played in self._finished]),
-                np.concatenate([played.steps for played in self._finished]),
-                np.concatenate([played.returns for played in self._finished]),
-            )
-            self._log_episodes(metrics, finished)
-            self._log_agents(metrics, finished)
-        self._logged_steps, self._logged_episodes = self.steps, self.episodes
-        self._clear()
-
-    def _log_plays(self, metrics: MetricsLogger) -> None:
         for policy, plays in self._plays.items():
             dist_inputs = np.concatenate(plays)
             entropy = float(self._distributions[policy].entropy(dist_inputs).mean())
             metrics.log_value((policy, ENTROPY), entropy, window=1)
             metrics.log_value((NUM_MODULE_STEPS_SAMPLED, policy), len(dist_inputs), reduce="sum")
             metrics.log_value((NUM_MODULE_STEPS_SAMPLED_LIFETIME, policy), len(dist_inputs), reduce="lifetime_sum")
+        if self._finished:
+            self._log_episodes(metrics)
+        self._logged_steps, self._logged_episodes = self.steps, self.episodes
+        self._clear()
 
-    def _log_episodes(self, metrics: MetricsLogger, episodes: PlayedEpisodes) -> None:
-        lengths, returns = episodes.lengths, episodes.returns.sum(axis=1)
+    def _log_episodes(self, metrics: MetricsLogger) -> None:
+        finished = PlayedEpisodes(
+            np.concatenate([played.lengths for played in self._finished]),
+            np.concatenate([played.steps for played in self._finished]),
+            np.concatenate([played.returns for played in self._finished]),
+        )
+        lengths, returns = finished.lengths, finished.returns.sum(axis=1)
         for key, values, statistic in (
             (EPISODE_LEN_MEAN, lengths, np.mean),
             (EPISODE_LEN_MIN, lengths, np.min),
@@ -172,16 +158,14 @@ class PlayMetrics:
             (EPISODE_RETURN_MAX, returns, np.max),
         ):
             metrics.log_value(key, float(statistic(values)), window=1)
-
-    def _log_agents(self, metrics: MetricsLogger, episodes: PlayedEpisodes) -> None:
         for index, name in enumerate(self._agents):
-            steps = _log_means(metrics, EPISODE_AGENT_RETURN_MEAN, EPISODE_AGENT_LEN_MEAN, name, episodes, [index])
+            steps = _log_means(metrics, EPISODE_AGENT_RETURN_MEAN, EPISODE_AGENT_LEN_MEAN, name, finished, [index])
             if steps:
                 metrics.log_value((NUM_AGENT_STEPS_SAMPLED, name), steps, reduce="sum")
                 metrics.log_value((NUM_AGENT_STEPS_SAMPLED_LIFETIME, name), steps, reduce="lifetime_sum")
         for policy in dict.fromkeys(self._policies):
             agents = [index for index, agent_policy in enumerate(self._policies) if agent_policy == policy]
-            _log_means(metrics, EPISODE_MODULE_RETURN_MEAN, EPISODE_MODULE_LEN_MEAN, policy, episodes, agents)
+            _log_means(metrics, EPISODE_MODULE_RETURN_MEAN, EPISODE_MODULE_LEN_MEAN, policy, finished, agents)
 
     def _clear(self) -> None:
         self._plays: dict[str, list[NDArray]] = defaultdict(list)

@@ -129,7 +129,18 @@ class ChunkBuilder:
         finals = [end.observations for end in ends if end.observations is not None]
         observations, played = _stack([*self._observations, *finals]), _stack(self._plays)
         chunks = self._chunks(name, layout, ends, observations, played)
-        self._carry_over(layout, observations, played)
+        # The next sample starts with the last row of each open chunk. Rows with actions come first, since the rows that
+        # must act next were observed last.
+        is_open = layout.ends == NO_ROW
+        self._started[:] = 0
+        self._started[layout.slots[is_open]] = (layout.started + layout.steps)[is_open]
+        kept = np.sort(layout.rows[layout.lasts[is_open]])
+        acted = kept[kept < (len(played[ACTIONS]) if played else 0)]
+        self._slots = [np.concatenate(self._slots)[kept]]
+        self._rewards = [np.concatenate(self._rewards)[kept]]
+        self._observations = [{name: array[kept] for name, array in observations.items()}]
+        self._plays = [{name: column[acted] for name, column in played.items()}] if len(acted) else []
+        self._observed = len(kept)
         return chunks
 
     def _layout(self, ends: Sequence[EpisodeEnds]) -> ChunkLayout:
@@ -197,22 +208,6 @@ class ChunkBuilder:
             terminated=terminated[layout.ends[is_whole]],
             truncated=truncated[layout.ends[is_whole]],
         )
-
-    def _carry_over(self, layout: ChunkLayout, observations: Rows, played: Rows) -> None:
-        """Start the next sample with the last row of each open chunk.
-
-        Rows with actions come first, since the rows that must act next were observed last.
-        """
-        is_open = layout.ends == NO_ROW
-        self._started[:] = 0
-        self._started[layout.slots[is_open]] = (layout.started + layout.steps)[is_open]
-        kept = np.sort(layout.rows[layout.lasts[is_open]])
-        acted = kept[kept < (len(played[ACTIONS]) if played else 0)]
-        self._slots = [np.concatenate(self._slots)[kept]]
-        self._rewards = [np.concatenate(self._rewards)[kept]]
-        self._observations = [{name: array[kept] for name, array in observations.items()}]
-        self._plays = [{name: column[acted] for name, column in played.items()}] if len(acted) else []
-        self._observed = len(kept)
 
 
 def _stack(blocks: Sequence[Mapping[str, NDArray]]) -> Rows:

@@ -1,10 +1,13 @@
 """Environment runners for off-policy algorithms: exploring play, recorded as transitions for replay."""
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 
 from league.config.off_policy import MADDPGConfig
+from league.config.opponents import OpponentConfig
 from league.random.seeds import derive
 from training.modules.distributions import TorchGaussian
 from training.replay_buffer import TransitionBlock
@@ -27,11 +30,20 @@ class ReplayRunner(BatchedEnvRunner):
         self._closed = self.recorders(self.interface, self.env.agents, self.env.num_envs, initial)
         self._play.recorder = self._closed
 
-    def transitions(self, actions: int, exploration: float) -> tuple[int, dict[str, TransitionBlock]]:
+    def transitions(
+        self, actions: int, exploration: float, opponents: Sequence[OpponentConfig] = ()
+    ) -> tuple[int, dict[str, TransitionBlock]]:
         """Play at least `actions` actions of all agents.
 
-        Returns their exact number, and buffer key → completed transitions. exploration: see PolicyModule.
+        Args:
+            actions: Their minimum number.
+            exploration: See PolicyModule.
+            opponents: Those from the league in new episodes.
+
+        Returns:
+            The exact number of actions, and buffer key → completed transitions.
         """
+        self.exchange_opponents(opponents)
         assert self._play is not None, "a runner that only holds weights cannot sample"
         play = self._play
         for module in self.module.values():
@@ -39,9 +51,9 @@ class ReplayRunner(BatchedEnvRunner):
         with self._errors_with_league(), one_thread():
             if not self._has_begun:
                 self.reset_episodes(self.num_env_steps_sampled_lifetime)
-            before = play.metrics.steps
+            before, forward = play.metrics.steps, partial(self._forward, self.module.forward_exploration)
             while play.metrics.steps < before + actions:
-                play.step(self._forward_exploration, explore=True)
+                play.step(forward, explore=True)
         return play.metrics.steps - before, self._closed.cut()
 
     def sample_chunks(self, **kwargs: Any) -> list[EpisodeChunks]:

@@ -213,7 +213,11 @@ class SelfPlay:
             dist_inputs = output.dist_inputs
             raw, log_p = self._drawn(policy, batch, dist_inputs) if explore else drawing.mode(dist_inputs)
             if output.state is not None:
-                self._recurrent_states[policy].update(batch, _with_previous_action(output.state, raw))
+                state = output.state
+                if PREVIOUS_ACTION in state:
+                    # The drawn action, which may differ from the greedy one that the module has stored.
+                    state = state | {PREVIOUS_ACTION: raw[:, np.newaxis].astype(np.float32) + 1}
+                self._recurrent_states[policy].update(batch, state)
         self.recorder.act(policy, raw, log_p, dist_inputs, forward_input.state)
         self.metrics.add_play(policy, dist_inputs)
         return to_environment(raw, self._actions[policy])
@@ -230,8 +234,3 @@ class SelfPlay:
         """Return random legal raw actions, and distribution inputs that represent them."""
         mask = batch.observations.get(ACTION_MASK)
         return self._distributions[policy].uniform(mask, len(batch), self._rng)
-
-
-def _with_previous_action(state: State, raw: NDArray) -> State:
-    """Store the drawn action in the state, if the state contains the previous action."""
-    return state | {PREVIOUS_ACTION: raw[:, np.newaxis].astype(np.float32) + 1} if PREVIOUS_ACTION in state else state

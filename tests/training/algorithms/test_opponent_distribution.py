@@ -51,10 +51,6 @@ def test_a_higher_power_prefers_stronger_opponents(power: float, expected: list[
     np.testing.assert_allclose(opponent_distribution(settings, [0.0, 0.5], np.full((2, 2), NAN)), expected)
 
 
-def test_the_former_name_of_a_weighting_is_read() -> None:
-    assert LeagueOpponentsConfig.model_validate({"weighting": "squared"}).weighting == "power"
-
-
 def test_forgotten_opponents_have_a_share_of_their_own() -> None:
     found = distribution([1.0, 0.6, 0.69, 0.7], sampling="latest", forgotten=0.2)
     np.testing.assert_allclose(found, [0.0, 0.1, 0.1, 0.8])

@@ -104,7 +104,7 @@ def test_each_network_has_its_own_optimizer_and_loss(critic: str) -> None:
     seen, done = learner._critic_inputs(rows, order)
     for name, loss in (
         ("a.critic", critic_loss(learner.networks["a.critic"](seen, done), torch.zeros(len(done[0])))),
-        ("a", learner._policy_loss("a", seen, done, torch.ones(len(done[0])))),
+        ("a", learner.policy_loss("a", seen, done, torch.ones(len(done[0])))),
     ):
         before = {key: weights(network) for key, network in learner.networks.items()}
         learner.gradient_step(loss, [name])
@@ -118,7 +118,7 @@ def test_an_actor_step_increases_the_value_of_its_critic() -> None:
     everyone = torch.ones(len(done[0]))
     losses = []
     for _ in range(10):
-        loss = learner._policy_loss("a", seen, done, everyone)
+        loss = learner.policy_loss("a", seen, done, everyone)
         losses.append(loss.item())
         learner.gradient_step(loss, ["a"])
     assert all(after < before for before, after in itertools.pairwise(losses)), losses
