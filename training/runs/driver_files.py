@@ -55,11 +55,8 @@ class DriverFiles:
         """Release what this object uses."""
 
 
-class FileActor:
+class FileActor(DriverFiles):
     """A Ray actor that reads and writes files on the driver's machine. It ends with the driver."""
-
-    def __init__(self) -> None:
-        self._files = DriverFiles()
 
     def files_in(self, directory: Path) -> list[str]:
         return files_in(directory)
@@ -70,22 +67,10 @@ class FileActor:
             file.seek(start)
             return file.read(CHUNK)
 
-    def draft(self, target: Path) -> Path:
-        return self._files.draft(target)
-
     def append(self, path: Path, content: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab") as file:
             file.write(content)
-
-    def commit(self, draft: Path, target: Path) -> None:
-        self._files.commit(draft, target)
-
-    def exists(self, path: Path) -> bool:
-        return path.exists()
-
-    def keep_only(self, directory: Path) -> None:
-        self._files.keep_only(directory)
 
 
 class RemoteDriverFiles(DriverFiles):

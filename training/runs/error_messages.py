@@ -14,6 +14,7 @@ FRAME_LINE = re.compile(r'^\s*File "(?P<file>.+)", line (?P<line>\d+), in ', re.
 ROOT = Path(training.__file__).parent.parent
 OWN_PATHS = ("<", *(f"{ROOT}/{package}/" for package in ("league", "training", "policy_league")))
 LIBRARY_PATHS = ("-packages/", "/lib/python")
+RAY_PATH = "-packages/ray/"
 
 
 def training_error(error: BaseException, league: str, trace: Path) -> LeagueError:
@@ -26,7 +27,16 @@ def training_error(error: BaseException, league: str, trace: Path) -> LeagueErro
     for cause in causes:
         if isinstance(cause, LeagueError) and not isinstance(cause, RayTaskError):
             return cause
-    place = _user_frame(_full_traceback(error))
+    # The traceback of each process that the error passed through.
+    tracebacks = [*(remote_traceback(cause) for cause in causes), "".join(traceback.format_exception(error))]
+    frames = [
+        f"{match['file']}:{match['line']}"
+        for match in FRAME_LINE.finditer("\n".join(tracebacks))
+        if not match["file"].startswith(OWN_PATHS) and RAY_PATH not in match["file"]
+    ]
+    # The last frame in the user's code, otherwise in a library.
+    theirs = [frame for frame in frames if not any(part in frame for part in LIBRARY_PATHS)]
+    place = next(reversed(theirs or frames), None)
     fault = one_line(causes[-1], with_type=True, first_line=True)
     where = " ".join(["", *(["at " + place] if place else []), *getattr(causes[-1], "__notes__", [])])
     return LeagueError(f"league {league}: training failed with {fault}{where}; see the traceback in {trace}")
@@ -45,22 +55,3 @@ def _causes(error: BaseException) -> list[BaseException]:
         causes.append(current)
         current = getattr(current, "cause", None) or current.__cause__
     return causes
-
-
-def _full_traceback(error: BaseException) -> str:
-    """Return the tracebacks of all processes that the error passed through."""
-    texts = [remote_traceback(cause) for cause in _causes(error)]
-    return "\n".join([*texts, "".join(traceback.format_exception(error))])
-
-
-def _user_frame(trace: str) -> str | None:
-    """Return `file:line` of the last frame in the user's code, otherwise in a library; own code and Ray are skipped."""
-    frames = [
-        f"{match['file']}:{match['line']}" for match in FRAME_LINE.finditer(trace) if not _is_own_code(match["file"])
-    ]
-    theirs = [frame for frame in frames if not any(part in frame for part in LIBRARY_PATHS)]
-    return next(reversed(theirs or frames), None)
-
-
-def _is_own_code(file: str) -> bool:
-    return file.startswith(OWN_PATHS) or "-packages/ray/" in file

@@ -43,15 +43,23 @@ def submit(address: str, config: Path, arguments: Sequence[str], storage: Storag
     host = urlsplit(address).hostname
     if not address.startswith(("http://", "https://")) or host is None:
         raise ConfigError(f"--job: expected --address http://HOST:8265, the cluster's dashboard, got {address!r}")
-    if host not in LOOPBACK:
-        _check_reach(host, storage)
+    try:
+        if host not in LOOPBACK:
+            storage.check_reach({"here", host})
+    except ConfigError as error:
+        raise ConfigError(
+            f"--job: {host} is another machine: set LEAGUE_DATABASE_URL to a PostgreSQL server, LEAGUE_ARTIFACTS to a"
+            " directory that both mount, and LEAGUE_HOME to one on the cluster's head"
+        ) from error
     storage.check_no_password("Ray's dashboard")
     silence_job_submission()
     client = _client(address)
     with tempfile.TemporaryDirectory() as directory:
         shutil.copy(config, directory)
         command = shlex.join(["league", "train", config.name, "--address", "auto", *arguments])
-        job = _begin(client, command, {"working_dir": directory, "env_vars": _environment(storage)})
+        # The same storage, and a PATH that includes this `league`.
+        environment = storage.environment | {"PATH": f"${{PATH}}:{Path(sys.executable).parent}"}
+        job = _begin(client, command, {"working_dir": directory, "env_vars": environment})
     say(f"Submitted job {job}. To stop it: ray job stop {job} --address {address}")
     try:
         asyncio.run(_follow(client, job, say))
@@ -59,7 +67,9 @@ def submit(address: str, config: Path, arguments: Sequence[str], storage: Storag
         say(f"\nThe job continues. To follow it: ray job logs {job} --follow --address {address}")
         say(f"To stop it: ray job stop {job} --address {address}")
         raise
-    _check_end(client, job)
+    info = client.get_job_info(job)
+    if info.status is not JobStatus.SUCCEEDED:
+        raise LeagueError(f"job {job}: {info.status.value.lower()}: {' '.join((info.message or '').split())}")
 
 
 def _client(address: str) -> JobSubmissionClient:
@@ -87,24 +97,3 @@ def _begin(client: JobSubmissionClient, command: str, runtime_env: dict[str, Any
 async def _follow(client: JobSubmissionClient, job: str, say: Callable[[str], None]) -> None:
     async for lines in client.tail_job_logs(job):
         say(lines.rstrip("\n"))
-
-
-def _check_end(client: JobSubmissionClient, job: str) -> None:
-    info = client.get_job_info(job)
-    if info.status is not JobStatus.SUCCEEDED:
-        raise LeagueError(f"job {job}: {info.status.value.lower()}: {' '.join((info.message or '').split())}")
-
-
-def _environment(storage: Storage) -> dict[str, str]:
-    """Return the job's environment variables: the same storage, and a PATH that includes this `league`."""
-    return storage.environment | {"PATH": f"${{PATH}}:{Path(sys.executable).parent}"}
-
-
-def _check_reach(host: str, storage: Storage) -> None:
-    try:
-        storage.check_reach({"here", host})
-    except ConfigError as error:
-        raise ConfigError(
-            f"--job: {host} is another machine: set LEAGUE_DATABASE_URL to a PostgreSQL server, LEAGUE_ARTIFACTS to a"
-            " directory that both mount, and LEAGUE_HOME to one on the cluster's head"
-        ) from error

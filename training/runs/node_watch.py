@@ -47,18 +47,16 @@ class NodeWatch(NotPickled, tune.Callback):
             return
         self._next_look = time.monotonic() + NODE_POLL
         try:
-            self._look()
+            nodes = [node for node in node_resources() if node.get("CPU")]
+            reason = self._reason_to_move() if self.reason is None else None
         except RpcError:  # the head is restarting
             return
-
-    def _look(self) -> None:
-        nodes = [node for node in node_resources() if node.get("CPU")]
         cpus, gpus = (sum(node.get(name, 0.0) for node in nodes) for name in ("CPU", "GPU"))
         used = f"{self._share * (1 + self._runners):g} of {cpus:g} CPUs"
         if self._gpus:
             used += f", {self._gpus:g} of {gpus:g} GPUs"
         status = f"Training on {len(self._nodes)} of {len(nodes)} nodes, {used}."
-        if self.reason is None and (reason := self._reason_to_move()) is not None:
+        if reason is not None:
             self.reason = reason
             self._request_move()
         elif self.reason is None and status != self._shown:

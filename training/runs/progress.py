@@ -91,57 +91,46 @@ class TrainingProgress(ProgressDisplay):
 def policy_summaries(metrics: Mapping[str, Any], policies: Mapping[str, str]) -> str:
     """Return a summary of the first few policies' metrics. policies: agent → policy id."""
     agents_of = {policy: [agent for agent in policies if policies[agent] == policy] for policy in policies.values()}
-    first = list(agents_of.items())[:MAX_POLICIES]
-    summaries = "; ".join(_policy_summary(policy, agents, metrics) for policy, agents in first)
+    formats = (("length", ".1f"), ("entropy", ".2f"))
+    summaries = []
+    for policy, agents in list(agents_of.items())[:MAX_POLICIES]:
+        values = [f"{name} {metrics[key]:{form}}" for name, form in formats if (key := f"{policy}/{name}") in metrics]
+        if (mean := metrics.get(f"{policy}/return")) is not None:
+            # If the agents win what the others lose, the mean is 0, but the first one's return shows the advantage of
+            # its side.
+            first = metrics.get(f"agents/{agents[0]}/return", 0.0)
+            is_zero_sum = abs(mean) < ZERO_RETURN <= abs(first)
+            values.insert(0, f"return {first:+.2f} as {agents[0]}" if is_zero_sum else f"return {mean:+.2f}")
+        summaries.append(f"{policy}: " + (", ".join(values) or "no finished episode yet"))
     more = len(agents_of) - MAX_POLICIES
-    return f"{summaries}; {more} more" if more > 0 else summaries
+    return "; ".join([*summaries, *([f"{more} more"] if more > 0 else [])])
 
 
 def opponent_summary(metrics: Mapping[str, Any]) -> str:
     """Return the scores against the most frequent opponents; empty if there are none."""
-    shares = {name.rpartition("/")[0]: value for name, value in metrics.items() if _is_opponent_share(name)}
+    shares = {
+        name.rpartition("/")[0]: value
+        for name, value in metrics.items()
+        if name.startswith(OPPONENT_PREFIX) and name.endswith("/share")
+    }
     scores = {name: metrics[f"{name}/score"] for name in shares if f"{name}/score" in metrics}
     frequent = sorted(scores, key=lambda opponent: shares[opponent], reverse=True)[:MAX_OPPONENTS]
     score_texts = [f"{scores[name]:.0%} against {name.removeprefix(OPPONENT_PREFIX)}" for name in frequent]
     return f"; score {', '.join(score_texts)}" if score_texts else ""
 
 
-def _is_opponent_share(name: str) -> bool:
-    return name.startswith(OPPONENT_PREFIX) and name.endswith("/share")
-
-
-def _policy_summary(policy: str, agents: Sequence[str], metrics: Mapping[str, Any]) -> str:
-    formats = (("length", ".1f"), ("entropy", ".2f"))
-    values = [f"{name} {metrics[key]:{form}}" for name, form in formats if (key := f"{policy}/{name}") in metrics]
-    if f"{policy}/return" in metrics:
-        values.insert(0, _return(metrics[f"{policy}/return"], agents, metrics))
-    return f"{policy}: " + (", ".join(values) or "no finished episode yet")
-
-
-def _return(mean: float, agents: Sequence[str], metrics: Mapping[str, Any]) -> str:
-    """Return the mean return of a policy. If its agents win what the others lose, the mean is 0, but the first agent's
-    return shows the advantage of its side.
-    """
-    first = metrics.get(f"agents/{agents[0]}/return", 0.0) if agents else 0.0
-    if abs(mean) < ZERO_RETURN <= abs(first):
-        return f"return {first:+.2f} as {agents[0]}"
-    return f"return {mean:+.2f}"
-
-
 def _pace(metrics: Mapping[str, Any], done: float) -> str:
-    remaining_seconds = metrics["seconds"] * (1 - done) / done if done else 0.0
-    speed = f"{metrics['steps_per_second']:,.0f} steps/s{_shares(metrics)}  " if "steps_per_second" in metrics else ""
-    return f"{speed}{clock(metrics['seconds'])} elapsed, {clock(remaining_seconds)} left"
-
-
-def _shares(metrics: Mapping[str, Any]) -> str:
-    """Return the shares of sampling and learning in the wall time since the last report."""
+    """Return the speed, the shares of sampling and learning in the wall time since the last report, and the times."""
     seconds = {name: metrics[name] for name in (*PHASES, OTHER_TIME) if name in metrics}
     total = sum(seconds.values())
-    phase_shares = [
+    shares = ", ".join(
         f"{seconds[name] / total:.0%} {name.removeprefix('time/')}" for name in SHOWN_PHASES if name in seconds
-    ]
-    return f" ({', '.join(phase_shares)})" if phase_shares else ""
+    )
+    speed = f"{metrics['steps_per_second']:,.0f} steps/s" if "steps_per_second" in metrics else ""
+    if speed:
+        speed += f" ({shares})  " if shares else "  "
+    remaining_seconds = metrics["seconds"] * (1 - done) / done if done else 0.0
+    return f"{speed}{clock(metrics['seconds'])} elapsed, {clock(remaining_seconds)} left"
 
 
 def clock(seconds: float) -> str:

@@ -28,7 +28,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from league.config.base import JSON, Part
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
-from league.config.training import TrainingSettings
 from league.config.validation_errors import describe_validation_error
 from league.errors import AlreadyRunning, ConfigError, NotFound, RunCorrupt
 from league.files import disk_errors, replacing
@@ -75,9 +74,15 @@ def pin_opponents(
     Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
     pins = {}
-    for written, is_opponent in dict.fromkeys(
-        reference for variant in (config, *trials) for reference in _references(variant)
-    ):
+    references: list[tuple[str | None, bool]] = []  # with whether it is an opponent
+    for settings in (variant.training for variant in (config, *trials)):
+        references += [(opponent.ref, True) for opponent in settings.opponents.fixed]
+        if isinstance(settings, PPOConfig):
+            references.append((settings.magnet.version if settings.magnet else None, False))
+            references.append((settings.teacher.ref if settings.teacher else None, False))
+    for written, is_opponent in dict.fromkeys(references):
+        if written is None:
+            continue
         ref = parse_ref(of_league(written, config.league))
         if isinstance(ref, RemoteRef):
             ref = fixed_version(ref, interface)
@@ -86,16 +91,6 @@ def pin_opponents(
             contestant(player, registry, interface)
         pins[written] = pinned
     return pins
-
-
-def _references(config: LeagueConfig) -> list[tuple[str, bool]]:
-    """The fixed opponents, the version of the magnet, and the teacher; each with whether it is an opponent."""
-    settings = config.training
-    references: list[tuple[str | None, bool]] = [(opponent.ref, True) for opponent in settings.opponents.fixed]
-    if isinstance(settings, PPOConfig):
-        references.append((settings.magnet.version if settings.magnet else None, False))
-        references.append((settings.teacher.ref if settings.teacher else None, False))
-    return [(ref, is_opponent) for ref, is_opponent in references if ref is not None]
 
 
 def with_pins(config: LeagueConfig, pins: dict[str, str]) -> LeagueConfig:
@@ -251,7 +246,12 @@ class RunDirectory:
                 f"{changed} has changed since training run {newest.name} began, so it cannot be resumed: "
                 f"set it back, or start a new run without --resume (with --from to continue from a version)"
             )
-        if record.complete and not _has_larger_budget(record.config.training, config.training):
+        # One larger limit is enough; the trial checks the other one.
+        (old_steps, old_minutes), (steps, minutes) = (
+            (settings.max_steps or math.inf, settings.minutes or math.inf)
+            for settings in (record.config.training, config.training)
+        )
+        if record.complete and steps <= old_steps and minutes <= old_minutes:
             raise NotFound(
                 f"training run {newest.name} is complete: there is nothing to resume, unless --steps or"
                 " --minutes is larger"
@@ -358,11 +358,3 @@ def changed_setting(old: LeagueConfig, new: LeagueConfig) -> str | None:
         if key not in RESUMABLE_SETTINGS and before.get(key) != after.get(key):
             return f"training.{key}"
     return None
-
-
-def _has_larger_budget(old: TrainingSettings, new: TrainingSettings) -> bool:
-    """Return whether one limit is larger; the trial checks the other one."""
-    (old_steps, old_minutes), (steps, minutes) = (
-        (settings.max_steps or math.inf, settings.minutes or math.inf) for settings in (old, new)
-    )
-    return steps > old_steps or minutes > old_minutes

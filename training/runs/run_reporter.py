@@ -103,7 +103,11 @@ class RunReporter:
 
     def report(self, metrics: Mapping[str, Any]) -> None:
         """Report a trial's latest metrics. Reports that arrive faster than the registry accepts them are merged."""
-        curves = {name: _rounded(metrics[name]) for name in _reported(metrics)}
+        names = [name for name, value in metrics.items() if is_metric(name, value) and name not in POINT_FIELDS]
+        returns = [name for name in names if name.startswith(AGENT_PREFIX) and name.endswith(AGENT_RETURN)]
+        common = [name for name in names if not name.startswith(AGENT_PREFIX)]
+        reported = common + returns if len(returns) <= MAX_AGENTS else common
+        curves = {name: float(f"{metrics[name]:.{DIGITS}g}") for name in reported}
         with self._lock:
             if self._newest is not None and self._newest is not self._reported:
                 curves = self._newest.curves | curves
@@ -112,32 +116,27 @@ class RunReporter:
         self._has_news.set()
 
     def _report_all(self) -> None:
+        league, run = self._run.record.config.league, self._run.id
         while not self._is_over:
             end = self._end  # read first, so that everything before the end is reported
             try:
-                self._report_newest()
+                if self._registered_attempt != (attempt := self._attempt):
+                    self._begin()
+                    self._registered_attempt = attempt
+                with self._lock:
+                    point, seconds = self._newest, self._seconds
+                self._registry.runs.record(league, run, None if point is self._reported else point, seconds)
+                self._reported = point
                 if end is not None:
-                    self._registry.runs.end(self._run.record.config.league, self._run.id, *end)
+                    self._registry.runs.end(league, run, *end)
                     return
                 self._is_reachable = True
             except Exception as error:  # reporting must never end a run
                 if self._is_reachable:
-                    logger.warning(
-                        "cannot report training run %s to the registry; training continues: %s", self._run.id, error
-                    )
+                    logger.warning("cannot report training run %s to the registry; training continues: %s", run, error)
                 self._is_reachable = False
             self._has_news.wait(HEARTBEAT_SECONDS if end is None else RETRY_SECONDS)
             self._has_news.clear()
-
-    def _report_newest(self) -> None:
-        league = self._run.record.config.league
-        if self._registered_attempt != (attempt := self._attempt):
-            self._begin()
-            self._registered_attempt = attempt
-        with self._lock:
-            point, seconds = self._newest, self._seconds
-        self._registry.runs.record(league, self._run.id, None if point is self._reported else point, seconds)
-        self._reported = point
 
     def _begin(self) -> None:
         config, training = self._run.record.config, self._run.record.config.training
@@ -164,14 +163,3 @@ def _ending(error: BaseException | None) -> tuple[RunState, str | None]:
         case Exception():
             return "failed", one_line(error, with_type=True)[:500]
     return "stopped", None
-
-
-def _reported(metrics: Mapping[str, Any]) -> list[str]:
-    names = [name for name, value in metrics.items() if is_metric(name, value) and name not in POINT_FIELDS]
-    returns = [name for name in names if name.startswith(AGENT_PREFIX) and name.endswith(AGENT_RETURN)]
-    common = [name for name in names if not name.startswith(AGENT_PREFIX)]
-    return common + returns if len(returns) <= MAX_AGENTS else common
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")

@@ -6,7 +6,7 @@ the scores of a version, never the run.
 
 import queue
 import threading
-from pathlib import Path
+from itertools import product
 from types import TracebackType
 from typing import Protocol, Self
 
@@ -80,26 +80,19 @@ class StrengthQueue:
             version = self._queue.get()
             try:
                 if not self._is_closed:
-                    self._report(version)
+                    assert self._measure is not None
+                    rows = self._measure(version, games=self._games)
+                    self._registry.strength.record(self._league, self._run.id, rows)
+                    # The names of TensorBoard's files contain the time in seconds only.
+                    directory, suffix = self._run.path / STRENGTH, f".{version.number}"
+                    with SummaryWriter(str(directory), filename_suffix=suffix) as writer:
+                        for row, name in product(rows, ("score", "low", "high")):
+                            tag = f"{STRENGTH}/{row.opponent}/{name}"
+                            writer.add_scalar(tag, getattr(row, name), global_step=row.steps)
+                    self._progress.measured(version, rows)
             except Exception as error:  # a measurement must never end a run
                 if not self._is_closed:
                     reason = one_line(error, with_type=not isinstance(error, LeagueError))
                     self._progress.say(f"The strength of {version.ref} was not measured: {reason}")
             finally:
                 self._queue.task_done()
-
-    def _report(self, version: VersionRow) -> None:
-        assert self._measure is not None
-        rows = self._measure(version, games=self._games)
-        self._registry.strength.record(self._league, self._run.id, rows)
-        _write(self._run.path / STRENGTH, version.number, rows)
-        self._progress.measured(version, rows)
-
-
-def _write(directory: Path, version: int, rows: list[StrengthRow]) -> None:
-    """Add the scores and the bounds of their intervals to the TensorBoard files."""
-    # The names of the files contain the time in seconds only.
-    with SummaryWriter(str(directory), filename_suffix=f".{version}") as writer:
-        for row in rows:
-            for name in ("score", "low", "high"):
-                writer.add_scalar(f"{STRENGTH}/{row.opponent}/{name}", getattr(row, name), global_step=row.steps)

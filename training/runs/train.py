@@ -108,7 +108,11 @@ def train(
         config = config.against(exploits)
         check(config, interface)
     start = None if parent is None else parent_version(registry, parent, config, interface)
-    earlier = _earlier_run(registry, config, role, resume, name)
+    earlier = None
+    if resume:
+        earlier = RunDirectory.resume(registry, config, role)
+    elif name is not None:
+        earlier = RunDirectory.find(registry, config, name)
     if earlier is not None and earlier.record.complete:
         # Its driver may have died between the end of training and its last report.
         with suppress(UnknownRun):
@@ -146,33 +150,19 @@ def _check_options(parent: CheckpointRef | None, role: Role, target: CheckpointR
         )
 
 
-def _earlier_run(
-    registry: Registry, config: LeagueConfig, role: Role, resume: bool, name: str | None
-) -> RunDirectory | None:
-    """Return the run to continue: the newest one of this role, or that with this id. None to begin a new one."""
-    if resume:
-        return RunDirectory.resume(registry, config, role)
-    return None if name is None else RunDirectory.find(registry, config, name)
-
-
 def _describe(
     config: LeagueConfig, interface: Interface, run: RunDirectory, dashboard: str | None, progress: TrainingProgress
 ) -> None:
     progress.say(f"{config.environment.entry_point}: {implementation(config.environment).reason}")
-    progress.say(_parallel_environments(config, interface))
+    count, runners = num_envs(config, len(interface.agents)), config.training.runners
+    where = f"each of {runners} runners" if runners > 1 else "one runner" if runners else "the learner's process"
+    progress.say(f"Environments: {count} in {where}.")
     if run.record.exploits is not None:
         progress.say(f"Role: {run.record.role}. Opponent in all episodes: {run.record.exploits}.")
     progress.say(describe_policies(interface))
     progress.say(describe_selection(config, interface))
     if dashboard:
         progress.say(f"Ray's dashboard: {dashboard}")
-
-
-def _parallel_environments(config: LeagueConfig, interface: Interface) -> str:
-    """Describe how many environments are sampled in parallel, and where."""
-    count, runners = num_envs(config, len(interface.agents)), config.training.runners
-    where = f"each of {runners} runners" if runners > 1 else "one runner" if runners else "the learner's process"
-    return f"Environments: {count} in {where}."
 
 
 def check(config: LeagueConfig, interface: Interface) -> None:

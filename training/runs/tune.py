@@ -68,17 +68,15 @@ def _check_nodes(learner: Mapping[str, float], runner: Mapping[str, float], runn
     for place, node in enumerate(nodes):
         if all(node.get(name, 0.0) >= amount for name, amount in learner.items()):
             leftover = {name: node.get(name, 0.0) - learner.get(name, 0.0) for name in node}
-            most = max(
-                most, sum(_fitting(runner, resources) for resources in [*nodes[:place], leftover, *nodes[place + 1 :]])
+            fitting = (
+                min(math.floor(resources.get(name, 0.0) / amount + ROUNDING) for name, amount in runner.items())
+                for resources in [*nodes[:place], leftover, *nodes[place + 1 :]]
             )
+            most = max(most, sum(fitting))
     if most < runners:
         what = f"the learner needs {_listed(learner)}" if most < 0 else f"{runners} runners need {_listed(runner)} each"
         have = "; ".join(_listed({name: node.get(name, 0.0) for name in ("CPU", "GPU")}) for node in nodes)
         raise ConfigError(f"training: {what}, but the nodes of the Ray cluster have {have}")
-
-
-def _fitting(runner: Mapping[str, float], node: Mapping[str, float]) -> int:
-    return min(math.floor(node.get(name, 0.0) / amount + ROUNDING) for name, amount in runner.items())
 
 
 def _listed(resources: Mapping[str, float]) -> str:

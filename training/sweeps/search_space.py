@@ -8,8 +8,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from league.config.league import LeagueConfig
 from league.config.sweep import SweepConfig
 from league.errors import ConfigError
@@ -25,15 +23,28 @@ DIGITS = 4
 def plan(config: LeagueConfig, sweep: SweepConfig) -> list[Settings]:
     """Return the settings of each trial, in order. Raises ConfigError for an invalid parameter."""
     for name, values in sweep.parameters.items():
-        _check(name, values)
+        if fault := _fault(values):
+            raise ConfigError(f"sweep.parameters.{name}: {fault}, got {values!r}")
     lists = {name: values for name, values in sweep.parameters.items() if isinstance(values, list)}
     combinations = itertools.product(*lists.values())
     trials = [dict(zip(lists, values, strict=True)) for values in combinations for _ in range(sweep.samples)]
     for number, settings in enumerate(trials):
         rng = generator(config.training.seed, "sweep", number)
         for name, values in sweep.parameters.items():
-            if isinstance(values, dict):
-                settings[name] = _draw(values, rng)
+            if not isinstance(values, dict):
+                continue
+            (kind, arguments), *_ = values.items()
+            match kind:
+                case "choice":
+                    settings[name] = arguments[rng.integers(len(arguments))]
+                case "randint":  # as in Ray Tune, without the upper bound
+                    settings[name] = int(rng.integers(*arguments))
+                case _:
+                    low, high = arguments
+                    ends = (math.log(low), math.log(high)) if kind == "loguniform" else (low, high)
+                    drawn = rng.uniform(*ends)
+                    value = math.exp(drawn) if kind == "loguniform" else drawn
+                    settings[name] = min(max(float(f"{value:.{DIGITS}g}"), float(low)), float(high))
     return [{name: settings[name] for name in sweep.parameters} for settings in trials]
 
 
@@ -61,12 +72,6 @@ def _nested(settings: Settings, document: dict[str, Any]) -> dict[str, Any]:
     return document
 
 
-def _check(name: str, values: Any) -> None:
-    fault = _fault(values)
-    if fault:
-        raise ConfigError(f"sweep.parameters.{name}: {fault}, got {values!r}")
-
-
 def _fault(values: Any) -> str | None:
     if isinstance(values, list):
         return None if values else "expected at least one value"
@@ -75,28 +80,15 @@ def _fault(values: Any) -> str | None:
     kind, arguments = next(iter(values.items()))
     if kind == "choice":
         return None if isinstance(arguments, list) and arguments else "expected choice: [value, …]"
-    if not _is_range(arguments) or (kind == "loguniform" and arguments[0] <= 0):
+    if not (
+        isinstance(arguments, Sequence)
+        and len(arguments) == 2
+        and all(isinstance(bound, int | float) and math.isfinite(bound) for bound in arguments)
+        and arguments[0] < arguments[1]
+        and (kind != "loguniform" or arguments[0] > 0)
+    ):
         least = "0 < low < high" if kind == "loguniform" else "low < high"
         return f"expected {kind}: [low, high] with {least}"
     if kind == "randint" and not all(isinstance(bound, int) for bound in arguments):
         return "expected randint: [low, high] in whole numbers"
     return None
-
-
-def _is_range(arguments: Any) -> bool:
-    if not isinstance(arguments, Sequence) or len(arguments) != 2:
-        return False
-    are_numbers = all(isinstance(bound, int | float) and math.isfinite(bound) for bound in arguments)
-    return are_numbers and arguments[0] < arguments[1]
-
-
-def _draw(values: dict[str, Any], rng: np.random.Generator) -> Any:
-    """Sample one value. As in Ray Tune, randint includes `low` and excludes `high`."""
-    (kind, arguments), *_ = values.items()
-    if kind == "choice":
-        return arguments[rng.integers(len(arguments))]
-    low, high = arguments
-    if kind == "randint":
-        return int(rng.integers(low, high))
-    value = math.exp(rng.uniform(math.log(low), math.log(high))) if kind == "loguniform" else rng.uniform(low, high)
-    return min(max(float(f"{value:.{DIGITS}g}"), float(low)), float(high))

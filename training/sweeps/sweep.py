@@ -137,7 +137,13 @@ def _conclude(
         TrialReport(number, settings, sweep.outcome(number), errors.get(number))
         for number, settings in enumerate(sweep.record.trials)
     ]
-    best, version = _best(trials, _settings(sweep)), None
+    sign = 1 if _settings(sweep).mode == "max" else -1
+    scored = {
+        trial.number: sign * trial.score
+        for trial in trials
+        if trial.outcome is not None and not trial.outcome.ended_early and trial.score is not None
+    }
+    best, version = trials[max(scored, key=lambda number: scored[number])] if scored else None, None
     is_whole = all(trial.outcome is not None or trial.error is not None for trial in trials)
     if is_whole and best is None and errors:
         raise next(iter(errors.values()))
@@ -185,6 +191,17 @@ def _run(
     }
     placements = {number: placement(league.training, share) for number, league in leagues.items()}
     watch = SweepCallback(sweep, settings.metric, progress)
+    scheduler: TrialScheduler = FIFOScheduler()
+    if settings.asha is not None:
+        scheduler = ASHAScheduler(
+            time_attr="steps",
+            metric=settings.metric,
+            mode=settings.mode,
+            grace_period=settings.asha.grace_steps,
+            reduction_factor=settings.asha.reduction_factor,
+            # A trial that has spent its budget ends by itself.
+            max_t=_max_steps(leagues.values()) + 1,
+        )
     tuner = tune.Tuner(
         tune.with_resources(
             tune.with_parameters(SweepTrial, plans=plans, metric=settings.metric),
@@ -192,7 +209,7 @@ def _run(
         ),
         param_space={TRIAL: tune.grid_search([_shown(sweep, number) for number in numbers])},
         tune_config=tune.TuneConfig(
-            scheduler=_scheduler(settings, leagues),
+            scheduler=scheduler,
             max_concurrent_trials=at_once,
             trial_dirname_creator=lambda trial: sweep.trial(trial.config[TRIAL][NUMBER]).name,
         ),
@@ -221,20 +238,6 @@ def _plan(
     return TrialPlan(start, checkpoints, sweep.stop_file, registry.storage, cpus=share, threads=threads, driver=driver)
 
 
-def _scheduler(settings: SweepConfig, leagues: Mapping[int, LeagueConfig]) -> TrialScheduler:
-    if settings.asha is None:
-        return FIFOScheduler()
-    return ASHAScheduler(
-        time_attr="steps",
-        metric=settings.metric,
-        mode=settings.mode,
-        grace_period=settings.asha.grace_steps,
-        reduction_factor=settings.asha.reduction_factor,
-        # A trial that has spent its budget ends by itself.
-        max_t=_max_steps(leagues.values()) + 1,
-    )
-
-
 def _max_steps(leagues: Iterable[LeagueConfig]) -> int:
     """Return the largest number of steps of a trial; a trial with a time limit only has no other."""
     return max(league.training.max_steps or sys.maxsize for league in leagues)
@@ -245,13 +248,6 @@ def _shown(sweep: SweepDirectory, number: int) -> dict[str, Any]:
     settings = sweep.record.trials[number]
     simple = {name: value if isinstance(value, int | float | str) else str(value) for name, value in settings.items()}
     return {NUMBER: number} | simple
-
-
-def _best(trials: list[TrialReport], settings: SweepConfig) -> TrialReport | None:
-    sign = 1 if settings.mode == "max" else -1
-    whole = [trial for trial in trials if trial.outcome is not None and not trial.outcome.ended_early]
-    scored = {trial.number: sign * trial.score for trial in whole if trial.score is not None}
-    return trials[max(scored, key=lambda number: scored[number])] if scored else None
 
 
 def _publish(sweep: SweepDirectory, number: int, interface: Interface, registry: Registry) -> VersionRow:
