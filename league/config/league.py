@@ -76,13 +76,20 @@ class LeagueConfig(Part):
     @classmethod
     def load(cls, path: Path | str) -> Self:
         """Read a YAML file. Raises ConfigError if it cannot be read, or the configuration is invalid."""
+        path = Path(path)
         try:
-            document = yaml.load(Path(path).read_text(encoding="utf-8"), UniqueKeyLoader)
+            document = yaml.load(path.read_text(encoding="utf-8"), UniqueKeyLoader)
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror or error}") from error
         except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: {describe_yaml_error(error)}") from error
-        return cls.from_mapping(_with_folder(document, Path(path)), source=str(path))
+        # An invalid document is refused below.
+        if isinstance(document, Mapping) and isinstance(configured_folder := document.get("folder"), str | None):
+            folder = (path.parent / (configured_folder or "")).resolve()
+            if not folder.is_dir():
+                raise ConfigError(f"{path}: folder: {folder} is not a directory")
+            document = {**document, "folder": str(folder)}
+        return cls.from_mapping(document, source=str(path))
 
     @classmethod
     def from_mapping(cls, document: Any, source: str = "configuration") -> Self:
@@ -171,17 +178,6 @@ def _large_integers(value: Any, key: str = "") -> Iterator[str]:
             yield from _large_integers(item, f"{key}.{index}")
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         yield f"{key}: {str(value)[:32]}"
-
-
-def _with_folder(document: Any, path: Path) -> Any:
-    """Make `folder` absolute. Invalid documents are returned as they are."""
-    configured_folder = document.get("folder") if isinstance(document, Mapping) else 0
-    if not isinstance(configured_folder, str | None):
-        return document
-    folder = (path.parent / (configured_folder or "")).resolve()
-    if not folder.is_dir():
-        raise ConfigError(f"{path}: folder: {folder} is not a directory")
-    return {**document, "folder": str(folder)}
 
 
 def _slug(kind: str, value: str) -> str:

@@ -2,7 +2,7 @@
 
 from typing import Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from league.config.base import ContestantRef, Part
 
@@ -49,11 +49,6 @@ class LeagueOpponentsConfig(Part):
     """Maximum number of opponents that episodes start with between two updates."""
     forgotten: float = Field(default=0.15, ge=0, le=1)
     """Fraction of the draws that is uniform over the opponents with x < 0.7, if there are any."""
-
-    @field_validator("weighting", mode="before")
-    @classmethod
-    def _from_former_name(cls, value: Any) -> Any:
-        return "power" if value == "squared" else value
 
 
 class OpponentsConfig(Part):

@@ -13,8 +13,6 @@ from league.config.algorithms import ALGORITHMS
 from league.config.schedules import SCHEDULE_FORMS
 from league.errors import one_line
 
-RENAMED_KEYS = {"copies": "num_envs"}
-"""Former key → current key."""
 SHOWN = 3
 """Number of faults in a message."""
 TYPES = {
@@ -44,8 +42,14 @@ def describe_yaml_error(error: Exception) -> str:
 
 def describe_validation_error(model: type[BaseModel], error: ValidationError) -> str:
     """Return the first faults as a sentence that names the keys and the expected values, unknown keys first."""
-    faults = _by_value(_without_consequences([Fault.of(model, detail) for detail in error.errors()]))
-    unknown_first = sorted(faults, key=lambda fault: not fault.is_unknown_key)
+    faults = _without_consequences([Fault.of(model, detail) for detail in error.errors()])
+    # A value that has none of several types is one fault.
+    combined: dict[tuple[Any, ...], Fault] = {}
+    for fault in faults:
+        other = combined.setdefault((fault.path, fault.message), fault)
+        expected = tuple(dict.fromkeys((*other.expected, *fault.expected)))
+        combined[fault.path, fault.message] = replace(fault, expected=expected)
+    unknown_first = sorted(combined.values(), key=lambda fault: not fault.is_unknown_key)
     first = list({str(fault): fault for fault in unknown_first}.values())[:SHOWN]
     # Several keys of one mapping have the same list.
     lists = [fault.known for fault in first]
@@ -77,11 +81,17 @@ class Fault:
             known_by, start = ALGORITHMS[path.pop(1)], 1
         if known_by in ALGORITHMS.values():
             path = [part for part in path if part not in SCHEDULE_FORMS]
-        path = [part for part in path if not _is_union_member(part, detail["type"])]
-        if (kind := detail["type"]) in TYPES:
+        kind = detail["type"]
+        # Pydantic puts the member of a union that it tried into the path: `tuple[str, ...]`, or a basic type.
+        path = [
+            part
+            for part in path
+            if isinstance(part, int) or not ("[" in part or (part in BASIC_TYPES and kind.endswith("_type")))
+        ]
+        if kind in TYPES:
             return cls(tuple(path), kind, f"got {detail['input']!r}", expected=(TYPES[kind],))
-        if detail["type"] != "extra_forbidden" or path[-1] in RENAMED_KEYS:
-            return cls(tuple(path), detail["type"], _message(detail, path))
+        if kind != "extra_forbidden":
+            return cls(tuple(path), kind, _message(detail))
         known_keys = _known_keys(known_by, path[start:-1])
         if guesses := difflib.get_close_matches(str(path[-1]), known_keys, n=1):
             return cls(tuple(path), "extra_forbidden", f"unknown key, did you mean {guesses[0]!r}?", guesses[0])
@@ -100,12 +110,10 @@ class Fault:
         return f"{key or 'file'}{algorithm}: {expected}{self.message}"
 
 
-def _message(detail: Any, path: list[str | int]) -> str:
+def _message(detail: Any) -> str:
     match detail["type"]:
         case "missing":
             return "missing, but required"
-        case "extra_forbidden":
-            return f"this key has been renamed to {RENAMED_KEYS[str(path[-1])]!r}"
         case "union_tag_invalid":
             return f"expected one of {', '.join(ALGORITHMS)}, got {detail['ctx']['tag']!r}"
         case "value_error":
@@ -113,11 +121,6 @@ def _message(detail: Any, path: list[str | int]) -> str:
         case "json_invalid":  # the input is the whole file
             return f"not valid JSON: {detail['ctx']['error']}"
     return f"{detail['msg'][0].lower()}{detail['msg'][1:]}, got {detail['input']!r}"
-
-
-def _is_union_member(part: str | int, kind: str) -> bool:
-    """Pydantic puts the member that it tried into the path: `tuple[str, ...]`, or the name of a basic type."""
-    return isinstance(part, str) and ("[" in part or (part in BASIC_TYPES and kind.endswith("_type")))
 
 
 def _without_consequences(faults: list[Fault]) -> list[Fault]:
@@ -130,16 +133,6 @@ def _without_consequences(faults: list[Fault]) -> list[Fault]:
         if not (fault.kind == "missing" and fault.path in misspelt)
         and not any(len(path) > len(fault.path) and path[: len(fault.path)] == fault.path for path in paths)
     ]
-
-
-def _by_value(faults: list[Fault]) -> list[Fault]:
-    """Combine the faults of a value that has none of several types."""
-    combined_faults: dict[tuple[Any, ...], Fault] = {}
-    for fault in faults:
-        key = (fault.path, fault.message)
-        expected = (*(combined_faults[key].expected if key in combined_faults else ()), *fault.expected)
-        combined_faults[key] = replace(fault, expected=tuple(dict.fromkeys(expected)))
-    return list(combined_faults.values())
 
 
 def _known_keys(model: type[BaseModel], path: list[str | int]) -> list[str]:

@@ -162,9 +162,3 @@ def test_exploiters_have_settings_of_their_own() -> None:
     assert (settings.lr.initial, settings.magnet, settings.gamma) == (0.1, None, 0.5)
     assert [opponent.ref for opponent in settings.opponents.fixed] == ["mini@3"]
     assert config.against("mini@3") == config.against("mini@3").against("mini@3")
-
-
-@pytest.mark.parametrize("section", ["play", "training"])
-def test_a_renamed_key_names_its_successor(section: str) -> None:
-    with pytest.raises(ConfigError, match=rf"{section}\.copies: this key has been renamed to 'num_envs'"):
-        LeagueConfig.from_mapping(MINIMAL | {section: {"copies": 4}})
