@@ -50,7 +50,9 @@ def import_module(key: str, name: str, folder: str | None = None) -> ModuleType:
     except ConfigError:
         raise
     except ImportError as error:
-        raise ConfigError(f"{key}: cannot import {name!r}: {_reason(error)}; searched: {_searched(folders)}") from error
+        working = [os.getcwd()] if {os.getcwd(), ""} & set(sys.path) else []
+        searched = ", ".join(dict.fromkeys([*folders, *working, "installed packages"]))
+        raise ConfigError(f"{key}: cannot import {name!r}: {_reason(error)}; searched: {searched}") from error
     except Exception as error:
         if not name or name.startswith("."):
             raise ConfigError(f"{key}: {name!r} is not a valid module name") from error
@@ -127,8 +129,3 @@ def _reason(error: Exception) -> str:
     """The message of an exception, with the line of the user's code that raised it."""
     place = raised_at(error)
     return f"{error} ({place})" if place else str(error)
-
-
-def _searched(folders: Sequence[str]) -> str:
-    working = [os.getcwd()] if {os.getcwd(), ""} & set(sys.path) else []
-    return ", ".join(dict.fromkeys([*folders, *working, "installed packages"]))

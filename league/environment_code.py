@@ -8,7 +8,7 @@ import ast
 import hashlib
 import sys
 import tokenize
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
@@ -145,15 +145,13 @@ def _imports(text: str, module: str, *, is_package: bool) -> Iterator[str]:
             yield from (f"{origin}.{alias.name}" for alias in node.names if alias.name != "*")
 
 
+_packages_distributions = cache(metadata.packages_distributions)
+
+
 @cache
 def _distributions(package: str) -> dict[str, str]:
     """Return distribution → version of the distributions that contain a top-level package."""
     try:
         return {package: metadata.version(package)}
     except metadata.PackageNotFoundError:
-        return {name: metadata.version(name) for name in _distribution_names().get(package, ())}
-
-
-@cache
-def _distribution_names() -> Mapping[str, list[str]]:
-    return metadata.packages_distributions()
+        return {name: metadata.version(name) for name in _packages_distributions().get(package, ())}

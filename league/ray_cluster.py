@@ -8,7 +8,7 @@ import os
 import socket
 import time
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -69,19 +69,14 @@ with one thread. With this number it takes no longer, and is nearly as fast on i
 def usable_cpus() -> int:
     """Return the number of CPUs that this process may use: at least one, and no more than its container has."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.ceil(min(allowed, _cpu_quota())))
-
-
-def _cpu_quota() -> float:
-    """CPUs to which the control group of this container is limited, in version 2 or 1; infinity without a limit."""
-    try:
-        if (limit := CGROUP / "cpu.max").exists():
+    with suppress(OSError, ValueError):  # no control groups, or `max`
+        if (limit := CGROUP / "cpu.max").exists():  # version 2
             quota, period = limit.read_text().split()
         else:
             quota, period = ((CGROUP / "cpu" / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
-        return int(quota) / int(period) if int(quota) > 0 else math.inf
-    except (OSError, ValueError):  # no control groups, or `max`
-        return math.inf
+        if int(quota) > 0:
+            return max(1, math.ceil(min(allowed, int(quota) / int(period))))
+    return max(1, allowed)
 
 
 def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
@@ -92,8 +87,8 @@ def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
     """
     import ray
 
-    if local.dashboard:
-        _check_dashboard()
+    if local.dashboard and (missing := [name for name in OF_DASHBOARD if find_spec(name) is None]):
+        raise ConfigError(f"--dashboard needs {missing[0]}: pip install 'ray[default]=={ray.__version__}'")
     os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)  # inherited by all processes of Ray
     for name, limit in LIMITS.items():
         os.environ.setdefault(name, limit)
@@ -127,8 +122,10 @@ def join(address: str, **options: Any) -> str | None:
     """
     import ray
 
+    host, colon, port = address.rpartition(":")
     try:
-        _check_port(address)
+        if colon and port.isdigit() and "/" not in host:
+            socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT).close()
         with loopback_addresses():
             context = ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
     except (OSError, ValueError, ray.exceptions.AuthenticationError) as error:
@@ -309,17 +306,3 @@ def check_unlimited(local: LocalRay) -> None:
     """Raise ConfigError if `local` has limits, which apply only to a local Ray."""
     if local != UNLIMITED:
         raise ConfigError("--cpus, --object-store and --dashboard are for a local Ray: a cluster has its own")
-
-
-def _check_dashboard() -> None:
-    import ray
-
-    if missing := [name for name in OF_DASHBOARD if find_spec(name) is None]:
-        raise ConfigError(f"--dashboard needs {missing[0]}: pip install 'ray[default]=={ray.__version__}'")
-
-
-def _check_port(address: str) -> None:
-    """Raise OSError if nothing listens at HOST:PORT."""
-    host, colon, port = address.rpartition(":")
-    if colon and port.isdigit() and "/" not in host:
-        socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT).close()

@@ -44,7 +44,10 @@ def check_slug(kind: str, text: str) -> str:
     if len(text) > MAX_SLUG:
         raise InvalidReference(f"{kind} {text[:32]!r}… has {len(text)} characters, expected at most {MAX_SLUG}")
     if not SLUG.fullmatch(text):
-        raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'{_guess(text)}")
+        # For a file `configs/my_game.yaml`, a version `my_game@3`, or `My_Game`.
+        name = text.rpartition("/")[2].partition("@")[0].removesuffix(".yaml").lower()
+        guess = f", did you mean {name!r}?" if SLUG.fullmatch(name) else ""
+        raise InvalidReference(f"{kind} {text!r} must consist of a-z, 0-9, '_' and '-'{guess}")
     return text
 
 
@@ -52,12 +55,6 @@ def check_new(kind: str, text: str) -> None:
     """Raise InvalidReference if a new name begins like an option of a command."""
     if text.startswith("-"):
         raise InvalidReference(f"{kind} {text!r} must not begin with '-'")
-
-
-def _guess(text: str) -> str:
-    """`, did you mean 'my_game'?` for a file `configs/my_game.yaml`, a version `my_game@3`, or `My_Game`."""
-    name = text.rpartition("/")[2].partition("@")[0].removesuffix(".yaml").lower()
-    return f", did you mean {name!r}?" if SLUG.fullmatch(name) else ""
 
 
 def parse_version(text: str) -> int | str:

@@ -1,5 +1,6 @@
 """Verified and installed versions of the packages that affect training, export and serving."""
 
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
@@ -30,12 +31,12 @@ OPTIONAL = ("rlcard",)
 
 def installed() -> dict[str, str]:
     """Return the versions of the installed packages in VERIFIED, with local build tags (`+cpu`)."""
-    return _versions(*VERIFIED)
+    return {package: number for package, number in _all_versions().items() if package in VERIFIED}
 
 
 def installed_with_this() -> dict[str, str]:
     """Return those of `installed` and of this program."""
-    return _versions(PROGRAM, *VERIFIED)
+    return dict(_all_versions())
 
 
 def difference(found: dict[str, str]) -> tuple[str, str, str] | None:
@@ -49,15 +50,11 @@ def difference(found: dict[str, str]) -> tuple[str, str, str] | None:
     return None
 
 
-def _versions(*packages: str) -> dict[str, str]:
-    versions = {package: _installed_version(package) for package in packages}
-    return {package: number for package, number in versions.items() if number is not None}
-
-
 @cache
-def _installed_version(package: str) -> str | None:
+def _all_versions() -> dict[str, str]:
     """Reading the metadata of a package takes about a millisecond, and it does not change while a process runs."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    versions = {}
+    for package in (PROGRAM, *VERIFIED):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    return versions

@@ -1,6 +1,6 @@
 """Adapters that give AEC, Parallel and MultiAgentEnv environments a common interface."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -240,17 +240,14 @@ class ParallelAdapter(_Simultaneous):
             self._check("step", STEP, returned)
             raise
         if self._present:
-            self._check_agents(observations)
+            agents = set(self._env.agents)
+            for agent in self._present - agents:
+                raise InvalidReturn(
+                    f"agent {agent} has left the environment neither terminated nor truncated: both need its key"
+                )
+            for agent in agents - observations.keys() - self._left:
+                raise InvalidReturn(f"agent {agent} is in `agents`, but has no observation")
         return reports
-
-    def _check_agents(self, observations: Mapping[str, Any]) -> None:
-        agents = set(self._env.agents)
-        for agent in self._present - agents:
-            raise InvalidReturn(
-                f"agent {agent} has left the environment neither terminated nor truncated: both need its key"
-            )
-        for agent in agents - observations.keys() - self._left:
-            raise InvalidReturn(f"agent {agent} is in `agents`, but has no observation")
 
 
 class MultiAgentAdapter(_Simultaneous):
@@ -272,8 +269,11 @@ class MultiAgentAdapter(_Simultaneous):
                 is_over = terminated.get("__all__", False) or truncated.get("__all__", False)
                 if is_over:
                     # Agents without their own flag get that of the episode.
-                    present_agents = {*self._present, *observations}
-                    terminated, truncated = _for_all(present_agents, terminated, truncated)
+                    present = {*self._present, *observations}
+                    unflagged = [agent for agent in present if not _flag(agent, terminated, truncated)]
+                    all_terminated = bool(terminated.get("__all__", False))
+                    terminated = dict(terminated) | dict.fromkeys(unflagged, all_terminated)
+                    truncated = dict(truncated) | dict.fromkeys(unflagged, not all_terminated)
                 reports = ended + self._reports(self._kept(observations), rewards, terminated, truncated)
             except UNFIT:
                 self._check("step", STEP, returned)
@@ -329,18 +329,6 @@ def _check_flags(agent: str, *flags: Mapping[str, Any]) -> None:
     for flag in (values.get(agent, False) for values in flags):
         if not isinstance(flag, bool | int | np.bool_) and np.shape(flag) != ():
             raise InvalidReturn(f"step returned {_shown(flag)} as a flag of {agent}: expected True or False")
-
-
-def _for_all(
-    agents: Iterable[str], terminated: Mapping[str, bool], truncated: Mapping[str, bool]
-) -> tuple[dict[str, bool], dict[str, bool]]:
-    """Add the flags of `__all__` for all `agents` without a flag."""
-    unflagged_agents = [agent for agent in agents if not _flag(agent, terminated, truncated)]
-    all_terminated = bool(terminated.get("__all__", False))
-    return (
-        dict(terminated) | dict.fromkeys(unflagged_agents, all_terminated),
-        dict(truncated) | dict.fromkeys(unflagged_agents, not all_terminated),
-    )
 
 
 def _copied(value: Any) -> Any:

@@ -5,7 +5,7 @@ and `action_space` return the spaces of an agent. Agents that are no strings, su
 get their texts as names; the environment itself receives its own ids.
 """
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -44,7 +44,11 @@ def with_api(env: Any, api: str) -> Any:
     if not _has_spaces(env):
         with suppress(Exception):  # the next one to read the spaces reports what is missing
             env.reset(seed=0)
-    ids = _ids(getattr(env, "possible_agents", ()) or ())
+    ids: dict[str, Any] = {}
+    for agent in getattr(env, "possible_agents", ()) or ():
+        if (name := _name(agent)) in ids:
+            raise EnvironmentMismatch(f"agents {ids[name]!r} and {agent!r} have the same name, expected different ones")
+        ids[name] = agent
     if all(name is agent for name, agent in ids.items()):
         return env
     named = {"aec": _NamedAEC, "parallel": _NamedParallel, "rllib": _NamedRLlib}
@@ -58,16 +62,6 @@ def _has_spaces(env: Any) -> bool:
     except Exception:
         return False
     return bool(agents) and all(isinstance(space, gymnasium.Space) for space in spaces)
-
-
-def _ids(agents: Iterable[Hashable]) -> dict[str, Any]:
-    """Return name → agent."""
-    ids: dict[str, Any] = {}
-    for agent in agents:
-        if (name := _name(agent)) in ids:
-            raise EnvironmentMismatch(f"agents {ids[name]!r} and {agent!r} have the same name, expected different ones")
-        ids[name] = agent
-    return ids
 
 
 def _name(agent: Hashable) -> str:

@@ -184,7 +184,14 @@ def describe(env: Any, config: LeagueConfig) -> Interface:
         policies = divide("policies", divided, names)
     sides = config.sides or {agent: (agent,) for agent in names}
     side_of = divide("sides", sides, names)
-    _check_equal_spaces(agents, policies)
+    first: dict[str, str] = {}
+    for agent, policy in policies.items():
+        other = first.setdefault(policy, agent)
+        if agents[agent] != agents[other]:
+            raise ConfigError(
+                f"policies.{policy}: {other} and {agent} have different spaces: assign them separate policies,"
+                " or pad the spaces with SuperSuit"
+            )
     _check_action_names(config.play, agents, policies)
     return Interface(
         agents=agents,
@@ -291,29 +298,18 @@ def divide(key: str, groups: dict[str, tuple[str, ...]], agents: list[str]) -> d
     """Return agent → the first group with a matching pattern."""
     of_agent = {}
     for agent in agents:
-        fitting = [group for group, patterns in groups.items() if _fits(agent, patterns)]
-        if not fitting:
+        fitting = (
+            group
+            for group, patterns in groups.items()
+            if any(fnmatch.fnmatchcase(agent, pattern) for pattern in patterns)
+        )
+        if (group := next(fitting, None)) is None:
             raise ConfigError(f"{key}: agent {agent!r} matches none of {', '.join(groups)}")
-        of_agent[agent] = fitting[0]
+        of_agent[agent] = group
     for group in groups:
         if group not in of_agent.values():
             raise ConfigError(f"{key}.{group}: matches no agent, expected some of {', '.join(agents)}")
     return of_agent
-
-
-def _fits(agent: str, patterns: tuple[str, ...]) -> bool:
-    return any(fnmatch.fnmatchcase(agent, pattern) for pattern in patterns)
-
-
-def _check_equal_spaces(agents: dict[str, AgentInterface], policies: dict[str, str]) -> None:
-    first: dict[str, str] = {}
-    for agent, policy in policies.items():
-        other = first.setdefault(policy, agent)
-        if agents[agent] != agents[other]:
-            raise ConfigError(
-                f"policies.{policy}: {other} and {agent} have different spaces: assign them separate policies,"
-                " or pad the spaces with SuperSuit"
-            )
 
 
 def _check_action_names(play: PlayConfig, agents: dict[str, AgentInterface], policies: dict[str, str]) -> None:

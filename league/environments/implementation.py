@@ -62,7 +62,17 @@ def implementation(config: EnvironmentConfig) -> Implementation:
     """Return how copies of an environment are stepped. Raises ConfigError if `environment.vector` or a wrapper of a
     vectorised environment is invalid."""
     base = _without_wrappers(config)
-    return _with_wrappers(base.vector, config) if config.wrappers and base.vector else base
+    if not config.wrappers or base.vector is None:
+        return base
+    if other := _if_verified(("supersuit",)):
+        return other
+    make = base.vector
+    try:
+        wrapped = wrapped_vector(make, config)
+    except UnsupportedWrapper as error:
+        return _in_lockstep(str(error))
+    names = ", ".join(wrapper.name for wrapper in config.wrappers)
+    return Implementation(wrapped, f"It is vectorised by {make.__module__}:{make.__qualname__}, with {names}.")
 
 
 def _without_wrappers(config: EnvironmentConfig) -> Implementation:
@@ -74,17 +84,6 @@ def _without_wrappers(config: EnvironmentConfig) -> Implementation:
     if config.api not in (None, verified.api):
         return _in_lockstep(f"{config.api} is not the vectorised API")
     return _if_verified(verified.packages) or _if_supported(verified.vector, config)
-
-
-def _with_wrappers(make: Callable[..., VectorEnv], config: EnvironmentConfig) -> Implementation:
-    if other := _if_verified(("supersuit",)):
-        return other
-    try:
-        wrapped = wrapped_vector(make, config)
-    except UnsupportedWrapper as error:
-        return _in_lockstep(str(error))
-    names = ", ".join(wrapper.name for wrapper in config.wrappers)
-    return Implementation(wrapped, f"It is vectorised by {make.__module__}:{make.__qualname__}, with {names}.")
 
 
 def _in_lockstep(reason: str) -> Implementation:
@@ -115,7 +114,10 @@ def stepping(config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, stat
 
 
 def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation:
-    make = _imported(entry_point, config.folder)
+    vector_class = import_entry_point("environment.vector", entry_point, config.folder)
+    if not (isinstance(vector_class, type) and issubclass(vector_class, VectorEnv)):
+        raise ConfigError(f"environment.vector: {entry_point} is not a subclass of VectorEnv")
+    make: Callable[..., VectorEnv] = vector_class
     try:
         make(1, **config.kwargs)
     except UnsupportedArguments as error:
@@ -123,10 +125,3 @@ def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation
     except TypeError as error:
         raise ConfigError(f"environment.kwargs: {entry_point} does not accept them: {error}") from error
     return Implementation(make, f"It is vectorised by {entry_point}.")
-
-
-def _imported(entry_point: str, folder: str | None) -> Callable[..., VectorEnv]:
-    vector_class = import_entry_point("environment.vector", entry_point, folder)
-    if not (isinstance(vector_class, type) and issubclass(vector_class, VectorEnv)):
-        raise ConfigError(f"environment.vector: {entry_point} is not a subclass of VectorEnv")
-    return vector_class

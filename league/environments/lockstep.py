@@ -27,7 +27,7 @@ from league.environments.stepping import (
 )
 from league.environments.vector.vector_env import AgentRows
 from league.errors import EnvironmentMismatch, InvalidReturn, InvalidReward, LeagueError, ObservationError
-from league.spaces import Leaf, inputs
+from league.spaces import inputs
 from league.spaces.arrays import environment_actions
 
 Given = TypeVar("Given")
@@ -175,7 +175,10 @@ class Lockstep:
             acting |= {env: self._reset(env) for env in starts.envs.tolist()}
         rows = [(env, report) for env in sorted(acting) for report in acting[env]]
         turn.states = self._states(sorted(env for env, env_reports in acting.items() if env_reports))
-        turn.endings = self._endings(endings)
+        blocks: dict[int, list[tuple[int, Report]]] = defaultdict(list)
+        for row in endings:
+            blocks[self._first_alike[row[1][0]]].append(row)
+        turn.endings = [self._block(blocks[first]) for first in sorted(blocks)]
         turn.batches = self._pending = self._batches(rows)
         return turn
 
@@ -229,13 +232,6 @@ class Lockstep:
             batches[group] = Batch(envs[of_group], agents[of_group], stacked, rewards)
         return batches
 
-    def _endings(self, rows: Sequence[tuple[int, Report]]) -> list[AgentRows]:
-        """Return one block for each observation space."""
-        blocks: dict[int, list[tuple[int, Report]]] = defaultdict(list)
-        for row in rows:
-            blocks[self._first_alike[row[1][0]]].append(row)
-        return [self._block(blocks[first]) for first in sorted(blocks)]
-
     def _block(self, rows: Sequence[tuple[int, Report]]) -> AgentRows:
         agents, observations, rewards, terminations, truncations = zip(*(report for _, report in rows), strict=True)
         return AgentRows(
@@ -263,18 +259,13 @@ class Lockstep:
             except (TypeError, ValueError):
                 stacked[name] = np.zeros(0)
             if stacked[name].shape != (len(agents), *leaf.shape):
-                raise self._misshapen(name, leaf, agents, observations)
+                shapes = [np.shape(row[name]) for row in observations]
+                number = next((i for i, shape in enumerate(shapes) if shape != leaf.shape), 0)
+                raise ObservationError(
+                    f"agent {self.agents[agents[number]]} observes {name} with shape {list(shapes[number])}, but its"
+                    f" space has {list(leaf.shape)}"
+                )
         return stacked
-
-    def _misshapen(
-        self, name: str, leaf: Leaf, agents: Sequence[int], observations: Sequence[Observation]
-    ) -> ObservationError:
-        shapes = [np.shape(row[name]) for row in observations]
-        row = next((i for i, shape in enumerate(shapes) if shape != leaf.shape), 0)
-        return ObservationError(
-            f"agent {self.agents[agents[row]]} observes {name} with shape {list(shapes[row])}, but its space has"
-            f" {list(leaf.shape)}"
-        )
 
 
 def _envs(numbers: Sequence[int]) -> Indices:

@@ -93,13 +93,11 @@ BGR = (0xFF0000, 0x00FF00, 0x0000FF)
 def with_one_copy(env: Any) -> Any:
     """Replace `observe` of pistonball by Pictures, if the screen has the expected format. Returns `env`."""
     bare = getattr(env, "unwrapped", env)
-    if type(bare).__module__ == PISTONBALL and bare.render_mode != "human" and _is_plain(bare.screen):
-        Pictures(bare)
+    if type(bare).__module__ == PISTONBALL and bare.render_mode != "human" and sys.byteorder == "little":
+        screen = bare.screen
+        if screen.get_bitsize() == 32 and tuple(screen.get_masks()[:3]) == BGR:
+            Pictures(bare)
     return env
-
-
-def _is_plain(screen: Any) -> bool:
-    return sys.byteorder == "little" and screen.get_bitsize() == 32 and tuple(screen.get_masks()[:3]) == BGR
 
 
 class Pictures:

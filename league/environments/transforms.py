@@ -143,7 +143,8 @@ def transform(
     kwargs = wrapper.kwargs
     match wrapper.name:
         case "color_reduction_v0":
-            return Stateless(channel(**kwargs) or _grey)
+            grey = channel(**kwargs) or (lambda rows: (rows.astype(np.float32) @ GRAYSCALE_WEIGHTS).astype(np.uint8))
+            return Stateless(grey)
         case "resize_v1":
             return _resize(space, **kwargs)
         case "frame_stack_v1" if kwargs.get("stack_dim", -1) == -1:
@@ -151,7 +152,10 @@ def transform(
         case "agent_indicator_v0":
             return Indicator(agent_indicator.get_indicator_map(agents, kwargs.get("type_only", False)), space)
         case "pad_observations_v0":
-            return Stateless(lambda rows: _padded(rows, changed.shape))
+            # Zeros are appended until each observation has the new shape.
+            missing = [(0, new - old) for new, old in zip(changed.shape, space.shape, strict=True)]
+            is_equal = changed.shape == space.shape
+            return Stateless(lambda rows: rows if is_equal else np.pad(rows, [(0, 0), *missing]))
         case "dtype_v0":
             return Stateless(lambda rows: rows.astype(kwargs["dtype"]))
         case "flatten_v0":
@@ -161,16 +165,6 @@ def transform(
         case "normalize_obs_v0":
             return _normalize(space, **kwargs)
     return None
-
-
-def _padded(rows: NDArray, shape: tuple[int, ...]) -> NDArray:
-    """Append zeros to observations (k, …) until each has the given shape."""
-    missing = [(0, new - old) for new, old in zip(shape, rows.shape[1:], strict=True)]
-    return np.pad(rows, [(0, 0), *missing]) if any(after for _, after in missing) else rows
-
-
-def _grey(rows: NDArray) -> NDArray:
-    return (rows.astype(np.float32) @ GRAYSCALE_WEIGHTS).astype(np.uint8)
 
 
 def _resize(space: spaces.Box, x_size: int, y_size: int, linear_interp: bool = True) -> Resize | None:

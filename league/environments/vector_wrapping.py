@@ -43,8 +43,13 @@ class WrapperStack:
         self._wrappers = [with_arguments(wrapper_config) for wrapper_config in config.wrappers]
         with closing(build(config.model_copy(update={"wrappers": ()}))) as env:
             self.stages = agent_spaces(env, config.wrappers)
-            if not isinstance(env, ParallelEnv):
-                _check_turn_based(config)
+            is_turn_based = not isinstance(env, ParallelEnv)
+        for wrapper in config.wrappers:
+            # In turn-based environments, some wrappers of observations also count the turns of other agents, and a
+            # reward is the sum of several rewards, each of which is clipped. In the verified ones all but the last are
+            # 0.
+            if is_turn_based and (wrapper.name not in OF_REWARDS or config.vector is not None):
+                raise UnsupportedWrapper(f"wrapper {wrapper.name} is vectorised for simultaneous actions only")
         before = list(zip(self._wrappers, self.stages, strict=False))
         actions = [_action_change(wrapper, stage) for wrapper, stage in before if wrapper.name in OF_ACTIONS]
         self.actions: list[Change] = [change for change in reversed(actions) if change is not None]
@@ -110,21 +115,20 @@ class WrappedVectorEnv(VectorEnv):
         """Change the rows, and join those of agents whose spaces have become equal."""
         joined: dict[int, list[AgentRows]] = {}
         for rows in blocks:
-            if len(rows.envs):
-                joined.setdefault(self._first_after[rows.agents[0]], []).append(self._changed(rows))
+            if not len(rows.envs):
+                continue
+            agent, rewards, observations = rows.agents[0], rows.rewards, rows.observations
+            for change in self._stack.rewards:
+                rewards = change(rewards)
+            if transforms := self._transforms[self._first_before[agent]]:
+                slots = rows.envs * len(self.possible_agents) + rows.agents
+                changed = observations[OBSERVATION]
+                for observation_transform in transforms:
+                    changed = observation_transform(changed, slots)
+                observations = {OBSERVATION: changed.astype(self._dtypes[agent], copy=False)}
+            changed_rows = replace(rows, rewards=rewards, observations=observations)
+            joined.setdefault(self._first_after[agent], []).append(changed_rows)
         return [_merged(joined[first]) for first in sorted(joined)]
-
-    def _changed(self, rows: AgentRows) -> AgentRows:
-        rewards, observations = rows.rewards, rows.observations
-        for change in self._stack.rewards:
-            rewards = change(rewards)
-        if transforms := self._transforms[self._first_before[rows.agents[0]]]:
-            slots = rows.envs * len(self.possible_agents) + rows.agents
-            changed = observations[OBSERVATION]
-            for observation_transform in transforms:
-                changed = observation_transform(changed, slots)
-            observations = {OBSERVATION: changed.astype(self._dtypes[rows.agents[0]], copy=False)}
-        return replace(rows, rewards=rewards, observations=observations)
 
 
 def wrapped_vector(make: MakeVectorEnv, config: EnvironmentConfig) -> MakeVectorEnv:
@@ -139,17 +143,6 @@ def wrapped_vector(make: MakeVectorEnv, config: EnvironmentConfig) -> MakeVector
 
     make_wrapped(1, **config.kwargs)
     return make_wrapped
-
-
-def _check_turn_based(config: EnvironmentConfig) -> None:
-    """Raise UnsupportedWrapper for wrappers that are vectorised for simultaneous actions only.
-
-    In turn-based environments, some wrappers of observations also count the turns of other agents, and a reward is the
-    sum of several rewards, each of which is clipped. In the verified ones all but the last are 0.
-    """
-    for wrapper in config.wrappers:
-        if wrapper.name not in OF_REWARDS or config.vector is not None:
-            raise UnsupportedWrapper(f"wrapper {wrapper.name} is vectorised for simultaneous actions only")
 
 
 def _action_change(wrapper: WrapperConfig, before: AgentSpaces) -> Change | None:

@@ -146,19 +146,16 @@ def _stock(env: AECEnv | ParallelEnv, wrapper: WrapperConfig, position: int) -> 
             f"before it, {agent} has observations {env.observation_space(agent)} and actions {env.action_space(agent)}"
         )
         raise ConfigError(f"{where}: {one_line(error)}; {context}") from error
-    return _with_whole_reset(made) if isinstance(made, aec_reward_lambda) else made
+    if isinstance(made, aec_reward_lambda):
+        stock = made.reset
 
+        def reset(seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+            # SuperSuit's reward wrapper keeps them from the previous episode.
+            vars(made).pop("_cumulative_rewards", None)
+            stock(seed=seed, options=options)
 
-def _with_whole_reset(env: AECEnv) -> AECEnv:
-    """Clear cumulative rewards at resets, which SuperSuit's reward wrapper keeps from the previous episode."""
-    stock = env.reset
-
-    def reset(seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        vars(env).pop("_cumulative_rewards", None)
-        stock(seed=seed, options=options)
-
-    env.reset = reset
-    return env
+        made.reset = reset
+    return made
 
 
 def _maker(name: str) -> Any:
@@ -183,13 +180,8 @@ def _maker(name: str) -> Any:
 
 def with_arguments(wrapper: WrapperConfig) -> WrapperConfig:
     """Convert arguments from YAML: lists to tuples, and names of functions to functions."""
-    return WrapperConfig(name=wrapper.name, kwargs={key: _argument(wrapper, key) for key in wrapper.kwargs})
-
-
-def _argument(wrapper: WrapperConfig, key: str) -> Any:
-    value = wrapper.kwargs[key]
-    if isinstance(value, list):
-        return tuple(value)
-    if not (key.endswith("_fn") and isinstance(value, str)):
-        return value
-    return import_entry_point(f"environment.wrappers: {wrapper.name}.{key}", value)
+    kwargs = {key: tuple(value) if isinstance(value, list) else value for key, value in wrapper.kwargs.items()}
+    for key, value in kwargs.items():
+        if key.endswith("_fn") and isinstance(value, str):
+            kwargs[key] = import_entry_point(f"environment.wrappers: {wrapper.name}.{key}", value)
+    return WrapperConfig(name=wrapper.name, kwargs=kwargs)

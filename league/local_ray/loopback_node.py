@@ -11,7 +11,7 @@ import random
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -97,8 +97,13 @@ def _node_class(base: Any) -> Any:
 
 def _await_registration(node: Node) -> None:
     """Wait until the raylet has registered. Raises StartFailed if a process ends before."""
+    from ray.exceptions import RpcError
+
     start_time = noticed = time.monotonic()
-    while not _is_registered(node):
+    while True:
+        with suppress(RpcError):  # the GCS did not answer in time
+            if node.get_gcs_client().get_all_node_info(timeout=NOTICE):
+                return
         for name, processes in node.all_processes.items():
             if any(info.process.poll() is not None for info in processes):
                 raise StartFailed(f"its process {name} ended; see {node.get_logs_dir_path()}")
@@ -106,15 +111,6 @@ def _await_registration(node: Node) -> None:
             noticed = current_time
             say(f"Waiting for Ray to start: its raylet has not registered after {current_time - start_time:.0f} s")
         time.sleep(POLL)
-
-
-def _is_registered(node: Node) -> bool:
-    from ray.exceptions import RpcError
-
-    try:
-        return bool(node.get_gcs_client().get_all_node_info(timeout=NOTICE))
-    except RpcError:  # the GCS did not answer in time
-        return False
 
 
 def say(line: str) -> None:

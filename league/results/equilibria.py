@@ -35,7 +35,11 @@ def alpha_rank(scores: ArrayLike, selection: float = 100.0, population: int = 50
     Raises:
         ValueError: For scores that do not add up to 1.
     """
-    table = _checked(scores)
+    table = np.asarray(scores, dtype=np.float64)
+    if table.ndim < 2 or table.shape[-1] != table.shape[-2]:
+        raise ValueError(f"scores must be square matrices, got shape {table.shape}")
+    if not np.allclose(table + np.swapaxes(table, -1, -2), 1.0, atol=1e-6):
+        raise ValueError("scores of two contestants must add up to 1, and be 1/2 on the diagonal")
     u = selection * population / (population - 1) * (np.swapaxes(table, -1, -2) - 0.5)
     with np.errstate(over="ignore", invalid="ignore"):
         fixation = np.where(np.abs(u) < 1e-12, 1 / population, np.expm1(-u) / np.expm1(-population * u))
@@ -137,16 +141,6 @@ def _most_even(inside: Floats, outside: Floats) -> Floats:
         options={"maxiter": 2_000, "maxfun": 10_000, "ftol": 1e-15, "gtol": 1e-9},
     )
     return np.asarray(softmax(-rows.T @ solved.x))
-
-
-def _checked(scores: ArrayLike) -> Floats:
-    table = np.asarray(scores, dtype=np.float64)
-    if table.ndim < 2 or table.shape[-1] != table.shape[-2]:
-        raise ValueError(f"scores must be square matrices, got shape {table.shape}")
-    whole = table + np.swapaxes(table, -1, -2)
-    if not np.allclose(whole, 1.0, atol=1e-6):
-        raise ValueError("scores of two contestants must add up to 1, and be 1/2 on the diagonal")
-    return table
 
 
 SMALLEST = 1e-250

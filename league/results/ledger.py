@@ -92,7 +92,12 @@ class Ledger:
 
         Raises LedgerConflict if one contradicts its schedule, or OutOfSpace.
         """
-        self._require_space()
+        file = self._database.engine.url.database
+        if self._database.is_sqlite and file and (free := free_space(Path(file))) < RESERVE:
+            raise OutOfSpace(
+                f"{free // 2**20} MB are free on the disk of {file}: games are recorded only if they leave "
+                f"{RESERVE // 2**20} MB; what was played so far is kept"
+            )
         with self._database.write() as session:
             schedules = {name: _schedule(session, name) for name in {match.schedule for match in matches}}
             for schedule in schedules.values():
@@ -107,15 +112,6 @@ class Ledger:
                 )
             return insert(session, tables.MatchTable, rows)
 
-    def _require_space(self) -> None:
-        """Raise OutOfSpace if the disk with the database is nearly full."""
-        file = self._database.engine.url.database
-        if self._database.is_sqlite and file and (free := free_space(Path(file))) < RESERVE:
-            raise OutOfSpace(
-                f"{free // 2**20} MB are free on the disk of {file}: games are recorded only if they leave "
-                f"{RESERVE // 2**20} MB; what was played so far is kept"
-            )
-
     def _add_size(self, session: Session, schedule: str, size: int) -> None:
         """Count the size of new games of a schedule. Raises OutOfSpace."""
         if schedule not in self._sizes:
@@ -129,11 +125,8 @@ class Ledger:
             )
         self._sizes[schedule] += size
 
-    def matches(self, *, league: str, schedule: str | None = None, after: int | None = None) -> list[Match]:
-        """Return the matches of a league, or of one of its schedules, in schedule order.
-
-        after: return only matches at later positions.
-        """
+    def matches(self, *, league: str, schedule: str | None = None) -> list[Match]:
+        """Return the matches of a league, or of one of its schedules, in schedule order."""
         with self._database.read() as session:
             schedules = {
                 league_schedule.id: league_schedule for league_schedule in _schedules(session, league, schedule)
@@ -143,8 +136,6 @@ class Ledger:
             )
             if schedule is not None:
                 query = query.where(tables.MatchTable.schedule == schedule)
-            if after is not None:
-                query = query.where(tables.MatchTable.position > after)
             groups = groupby(session.execute(query), key=attrgetter("schedule"))
             return [match for name, rows in groups for match in _matches(schedules[name], list(rows))]
 
@@ -188,7 +179,11 @@ class Ledger:
             leagues.require(session, league)
             query = select(*_LISTED).where(table.league == league)
             if before is not None:
-                query = query.where(tuple_(*_PLAYED) < _when_played(session, league, before))
+                schedule, position = _place(before)
+                when = select(*_PLAYED).filter_by(league=league, schedule=schedule, position=position)
+                if (sort_key := session.execute(when).first()) is None:
+                    raise InvalidInput(f"before: league {league} has no match {before!r}")
+                query = query.where(tuple_(*_PLAYED) < tuple(sort_key))
             query = query.order_by(*(column.desc() for column in _PLAYED)).limit(limit)
             # Each order of the contestants is a query of its own, because it is then a range of an index.
             parts = [query.where(table.first == first, table.second == second) for first, second in orders] or [query]
@@ -298,14 +293,6 @@ def _place(match: str) -> tuple[str, int]:
 def _no_match(match: str) -> UnknownMatch:
     schedule, _, position = match.rpartition("/")
     return UnknownMatch(f"schedule {schedule} has no match {position!r}")
-
-
-def _when_played(session: Session, league: str, match: str) -> tuple[Any, ...]:
-    schedule, position = _place(match)
-    sort_key = session.execute(select(*_PLAYED).filter_by(league=league, schedule=schedule, position=position)).first()
-    if sort_key is None:
-        raise InvalidInput(f"before: league {league} has no match {match!r}")
-    return tuple(sort_key)
 
 
 def _entries(session: Session, found: Subquery, limit: int) -> list[LedgerEntry]:

@@ -123,11 +123,6 @@ def _admit_game(match: Match, schedule: Schedule, index: int, game: Game) -> Non
     finite = [value is not None and math.isfinite(value) for value in game.returns]
     if finite != [contestant in seating for contestant in range(len(match.contestants))]:
         raise _refusal(match, f"game {index} needs a finite return of each contestant that played, not {game.returns}")
-    if game.forfeits:
-        _admit_forfeits(match, index, game, seating)
-
-
-def _admit_forfeits(match: Match, index: int, game: Game, seating: Collection[int]) -> None:
     for forfeit in game.forfeits:
         if forfeit.contestant not in seating:
             raise _refusal(

@@ -178,7 +178,12 @@ class Examiner:
                 returns[agent] += reward
                 _check_report(self._agents[agent], (agent, observation, reward, terminated, truncated), self._found)
                 if not (terminated or truncated):
-                    self._check_info(agent, observation, adapter.infos.get(self._agents[agent]))
+                    info = adapter.infos.get(self._agents[agent])
+                    is_unmasked = ACTION_MASK not in observation and mask_size(self._spaces[agent]) is not None
+                    if is_unmasked and isinstance(info, Mapping) and ACTION_MASK in info:
+                        # It is not used, because no info had one after the first reset.
+                        text = "gets a mask in its info after a step, but no agent gets one after reset: report masks"
+                        self._found.add("fault", f"{text} from reset on", self._agents[agent])
                     moves.append((agent, self._actions.draw(agent, observation.get(ACTION_MASK))))
             is_late = share is not None and step > 0 and self._budget.is_spent(share)
             if not moves or step == most or is_late:
@@ -189,13 +194,6 @@ class Examiner:
             self.place.step = step
             self._budget.report(f"{doing}, step {step}")
             reports = adapter.step(moves)
-
-    def _check_info(self, agent: int, observation: Observation, info: Any) -> None:
-        """Find masks in infos that are not used, because no info had one after the first reset."""
-        is_unused = ACTION_MASK not in observation and mask_size(self._spaces[agent]) is not None
-        if is_unused and isinstance(info, Mapping) and ACTION_MASK in info:
-            text = "gets a mask in its info after a step, but no agent gets one after reset: report masks from reset on"
-            self._found.add("fault", text, self._agents[agent])
 
     def _compare_views(self, reports: Sequence[Report]) -> None:
         """Find out whether two agents observe different things in one state."""

@@ -6,7 +6,7 @@ Episodes are played with random legal actions. A *fault* leads to wrong results 
 import contextlib
 import io
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
@@ -24,7 +24,7 @@ from league.environments.vector.equality import compare
 from league.environments.vector.measurement import steps_per_second
 from league.errors import InvalidReturn, LeagueError, cause, one_line, raised_at
 from league.interface import Interface
-from league.spaces import Box, Discrete, MultiDiscrete, Space
+from league.spaces import Box, Discrete, MultiDiscrete
 
 CYCLES = 50
 """Number of cycles of PettingZoo's API tests."""
@@ -77,7 +77,9 @@ def examine(
     examination.policies = describe_policies(interface)
     examination.actions = describe_selection(config, interface)
     for agent, spaces in interface.agents.items():
-        if not _is_supported(spaces.action):
+        action = spaces.action
+        is_float_box = isinstance(action, Box) and np.dtype(action.dtype).kind == "f"
+        if not (is_float_box or isinstance(action, Discrete | MultiDiscrete)):
             examination.add(
                 "fault", "has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats", agent
             )
@@ -111,28 +113,17 @@ def examine(
 
 def _explained(error: Exception, config: LeagueConfig, seed: int, place: str) -> str:
     """The fault that an exception shows. A wrapper's own exception does not say what it was given."""
-    if (returned := _return_below_wrappers(config, seed)) is not None:
-        return f"{returned} (below its wrappers, {place})"
+    if config.environment.wrappers:
+        bare = config.model_copy(update={"environment": config.environment.model_copy(update={"wrappers": ()})})
+        with contextlib.suppress(Exception):
+            try:
+                with contextlib.closing(build(bare.environment)) as env:
+                    interface = describe(env, bare)
+                    Examiner(env, interface, bare, Examination(), None, TimeBudget(BARE_SECONDS)).examine(1, seed)
+            except InvalidReturn as returned:
+                return f"{returned} (below its wrappers, {place})"
     where = "".join(f"{line}, " for line in [raised_at(error)] if line)
     return f"the environment raised an exception ({where}{place}): {one_line(error, with_type=True)}"
-
-
-def _return_below_wrappers(config: LeagueConfig, seed: int) -> str | None:
-    """What the environment returned to its first wrapper that does not fit; None if it has no wrappers, or nothing is
-    found in one episode.
-    """
-    if not config.environment.wrappers:
-        return None
-    bare = config.model_copy(update={"environment": config.environment.model_copy(update={"wrappers": ()})})
-    try:
-        with contextlib.closing(build(bare.environment)) as env:
-            interface = describe(env, bare)
-            Examiner(env, interface, bare, Examination(), None, TimeBudget(BARE_SECONDS)).examine(1, seed)
-    except InvalidReturn as error:
-        return str(error)
-    except Exception:
-        return None
-    return None
 
 
 def _compare_vectorised(config: EnvironmentConfig, interface: Interface, found: Examination, seed: int) -> None:
@@ -153,11 +144,6 @@ def _compare_vectorised(config: EnvironmentConfig, interface: Interface, found: 
     found.vectorised = Vectorised(comparison.steps, MEASURED_COPIES, rate, comparison.stock_rate)
 
 
-def _is_supported(space: Space) -> bool:
-    """Discrete, MultiDiscrete, or a Box of floats."""
-    return isinstance(space, Discrete | MultiDiscrete) or (isinstance(space, Box) and np.dtype(space.dtype).kind == "f")
-
-
 def _run_pettingzoo_tests(config: EnvironmentConfig, found: Examination, budget: TimeBudget) -> None:
     """Run PettingZoo's API tests. They check more than is required here, so failures are notes."""
     steps = CYCLES * (found.agents if found.api == "AEC" else 1)
@@ -169,17 +155,11 @@ def _run_pettingzoo_tests(config: EnvironmentConfig, found: Examination, budget:
     budget.report("PettingZoo's API test")
     with contextlib.closing(build(config)) as env:
         try:
-            with _silence():
+            with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+                warnings.simplefilter("ignore")
                 if isinstance(env, AECEnv):
                     api_test(env, num_cycles=CYCLES)
                 else:
                     parallel_api_test(env, num_cycles=CYCLES)
         except Exception as error:
             found.add("note", f"PettingZoo's API test fails: {one_line(error, with_type=True)}")
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.simplefilter("ignore")
-        yield

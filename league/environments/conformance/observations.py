@@ -38,13 +38,13 @@ class ObservationCheck:
             for name, leaf in self._leaves.items()
             if isinstance(leaf, Box) and not (normalizes and np.dtype(leaf.dtype).kind == "f")
         }
-        self._kept: tuple[Any, Observation] | None = None
+        self._kept: list[tuple[NDArray, NDArray]] = []
 
     def __call__(self, value: Any) -> Observation:
-        if self._kept is not None and _changed(*self._kept):
-            self._found.add(
-                "note", "its observations are modified after they are returned: they are copied", self._agent
-            )
+        for array, copy in self._kept:
+            if not np.array_equal(array, copy, equal_nan=True):
+                text = "its observations are modified after they are returned: they are copied"
+                self._found.add("note", text, self._agent)
         arrays = self.arrays(value)
         misshapen = [name for name, leaf in self._leaves.items() if arrays[name].shape != leaf.shape]
         for name in misshapen:
@@ -53,8 +53,12 @@ class ObservationCheck:
             if name == ACTION_MASK:
                 raise InvalidReturn(f"agent {self._agent} {text}")  # no legal action can be drawn
             self._found.add("fault", text, self._agent)
-        if not misshapen:
-            self._check_size(arrays)
+        for name, leaf in self._raw.items() if not misshapen else ():
+            largest = np.abs(arrays[name].astype(np.float64)).max()
+            if LARGEST < largest < np.inf:
+                text = f"observes {largest:.3g} in {name}: training needs values of at most {LARGEST:g}: scale them"
+                is_float = np.dtype(leaf.dtype).kind == "f"
+                self._found.add("fault", text + (", or set training.normalize_observations" * is_float), self._agent)
         if not misshapen and not self._gymnasium.contains(value):
             self._found.add(
                 "note",
@@ -64,16 +68,8 @@ class ObservationCheck:
                 example=_example_outside(self._leaves, arrays),
             )
         copies = {name: np.array(array) for name, array in arrays.items()}
-        self._kept = (arrays, copies)
+        self._kept = [(array, copies[name]) for name, array in arrays.items()]
         return copies
-
-    def _check_size(self, arrays: Observation) -> None:
-        for name, leaf in self._raw.items():
-            largest = np.abs(arrays[name].astype(np.float64)).max()
-            if LARGEST < largest < np.inf:
-                text = f"observes {largest:.3g} in {name}: training needs values of at most {LARGEST:g}: scale them"
-                is_float = np.dtype(leaf.dtype).kind == "f"
-                self._found.add("fault", text + (", or set training.normalize_observations" * is_float), self._agent)
 
     def arrays(self, value: Any) -> Observation:
         """Split an observation. Raises EnvironmentMismatch if its structure is not that of the space."""
@@ -89,10 +85,6 @@ class ObservationCheck:
 def _shortened(space: gymnasium.Space[Any]) -> str:
     text = str(space)
     return text if len(text) <= 80 else f"{text[:79]}…"
-
-
-def _changed(arrays: Observation, copies: Observation) -> bool:
-    return any(not np.array_equal(arrays[name], copies[name], equal_nan=True) for name in copies)
 
 
 def _example_outside(leaves: Mapping[str, Leaf], arrays: Observation) -> str:

@@ -78,13 +78,11 @@ class OpeningMeasurement:
         if not self.lengths:
             return f"{seeds}: random openings are not needed."
         if not (plies := self.recommended):
-            return f"{seeds}, and {self._effect_of_longest()}: they are not recommended, and all games start alike."
+            effect = self.effect(len(self.lengths))
+            effect = effect[0].lower() + effect[1:]
+            return f"{seeds}, and {effect}: they are not recommended, and all games start alike."
         warning = f" {self.warning(plies)}" if self.warning(plies) else ""
         return f"{seeds}. {self.effect(plies)}: play.opening_plies: {plies} is recommended.{warning}"
-
-    def _effect_of_longest(self) -> str:
-        effect = self.effect(len(self.lengths))
-        return effect[0].lower() + effect[1:]
 
     def warning(self, plies: int) -> str:
         """A sentence if openings of a measured length end many games, else empty."""
@@ -135,8 +133,13 @@ def measure_openings(
                 openings.append(games.random(seed + len(openings), LONGEST))
     except _OutOfTimeError:
         return None
-    lengths = tuple(_length(openings, plies) for plies in range(1, LONGEST + 1))
-    return OpeningMeasurement(different, SEEDS, lengths, recommended(lengths, median(whole)))
+    lengths = []
+    for plies in range(1, LONGEST + 1):
+        # Position 0 precedes the first step.
+        reached = [positions[plies] for positions in openings if len(positions) > plies]
+        ended = 1 - len(reached) / len(openings)
+        lengths.append(OpeningLength(len(set(reached)) / len(openings), ended, len(openings)))
+    return OpeningMeasurement(different, SEEDS, tuple(lengths), recommended(lengths, median(whole)))
 
 
 def recommended(lengths: Sequence[OpeningLength], game: float) -> int:
@@ -150,12 +153,6 @@ def recommended(lengths: Sequence[OpeningLength], game: float) -> int:
     enough = next((plies for plies in choices if lengths[plies - 1].distinct >= DIFFERENT_ENOUGH), None)
     best = enough or max(choices, key=lambda plies: lengths[plies - 1].positions)
     return best if lengths[best - 1].positions > 1 else 0
-
-
-def _length(openings: Sequence[Sequence[bytes]], plies: int) -> OpeningLength:
-    # Position 0 precedes the first step.
-    reached = [positions[plies] for positions in openings if len(positions) > plies]
-    return OpeningLength(len(set(reached)) / len(openings), 1 - len(reached) / len(openings), len(openings))
 
 
 class _Games:

@@ -190,9 +190,17 @@ def _training(found: Examination, interface: Interface, is_team: bool) -> Iterat
     else:
         yield _Line("  lr: 0.0005", "learning rate of Adam")
         yield _Line("  entropy: 0.05", "exploration; less makes the policy decide sooner")
-    leaves = [leaf for spaces in interface.agents.values() for leaf in _observed(spaces.observation)]
-    if convolutions := _convolutions(leaves):
-        axes = {channels_of(shape) for shape in _images(leaves)}
+    leaves = [
+        leaf
+        for spaces in interface.agents.values()
+        for name, leaf in inputs(spaces.observation).items()
+        if name != ACTION_MASK
+    ]
+    images = [leaf.shape for leaf in leaves if isinstance(leaf, Box) and len(leaf.shape) == 3]
+    sizes = [min(shape[1:] if channels_of(shape) == "first" else shape[:2]) for shape in images]
+    if sizes and min(sizes) >= SMALL_BOARD:
+        axes = {channels_of(shape) for shape in images}
+        convolutions = IMAGE_CONVOLUTIONS if min(sizes) >= IMAGE else BOARD_CONVOLUTIONS
         yield _Line(f"  convolutions: {_inline(convolutions)}", "for images in the observations")
         if len(axes) == 1:
             channels = axes.pop()
@@ -245,23 +253,6 @@ def _other_algorithms(interface: Interface, api: str) -> list[str]:
     if api != "AEC" and all(isinstance(action, Discrete | Box) for action in actions):
         algorithms.append("maddpg")
     return algorithms
-
-
-def _observed(space: Any) -> list[Leaf]:
-    return [leaf for name, leaf in inputs(space).items() if name != ACTION_MASK]
-
-
-def _images(leaves: list[Leaf]) -> list[tuple[int, ...]]:
-    """The shapes of the image-like parts of the observations."""
-    return [leaf.shape for leaf in leaves if isinstance(leaf, Box) and len(leaf.shape) == 3]
-
-
-def _convolutions(leaves: list[Leaf]) -> list[dict[str, int]]:
-    """Convolutions that fit the smallest image-like part of the observations; empty without one."""
-    sizes = [min(shape[1:] if channels_of(shape) == "first" else shape[:2]) for shape in _images(leaves)]
-    if not sizes or min(sizes) < SMALL_BOARD:
-        return []
-    return IMAGE_CONVOLUTIONS if min(sizes) >= IMAGE else BOARD_CONVOLUTIONS
 
 
 def _is_wide(leaf: Leaf) -> bool:

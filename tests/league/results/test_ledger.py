@@ -59,7 +59,6 @@ def test_matches_are_returned_exactly_in_schedule_order(ledger: Ledger) -> None:
     expected = [play_match(SCHEDULE, position) for position in (0, 2, 4)]
     assert ledger.matches(league=LEAGUE) == expected
     assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id) == expected
-    assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id, after=0) == expected[1:]
     assert ledger.matches(league=LEAGUE, schedule="another") == []
     assert ledger.positions(SCHEDULE.id) == {0, 2, 4}
     assert ledger.positions("another") == set()
