@@ -74,7 +74,7 @@ class Target:
 
 
 def _number(number: float) -> str:
-    return f"{number:,}" if isinstance(number, int) or abs(number) < 1 else f"{number:,.6g}"
+    return f"{number:,}" if isinstance(number, int) else f"{number:,.{4 if abs(number) < 1 else 6}g}"
 
 
 def _unit(unit: str) -> str:
