@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import blake2b
 
-from evaluation.results import Forfeits
+from evaluation.results import Document, Forfeits
 from evaluation.statistics.sequential import score_of
 from league.results.records import Game, Match
 
@@ -81,7 +81,7 @@ MIN_UPSET = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Upset:
+class Upset(Document):
     """A recorded game in which `better` scored `score` against `other` although the ratings predicted `expected`.
 
     match, game: position in the ledger.

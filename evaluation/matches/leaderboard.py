@@ -115,6 +115,7 @@ def _rank(standing: Standing) -> tuple[bool, float, str]:
 
 MOST_CONTESTANTS = 40
 """Contestants in the payoff matrix, the best ones."""
+MAX_UPSETS = 5
 
 
 class CountedGames:
@@ -124,10 +125,8 @@ class CountedGames:
     payoff matrix, or all if sides are rated.
     """
 
-    def __init__(
-        self, registry: Registry, league: LeagueRow, max_upsets: int = 0, conditions: Conditions | None = None
-    ) -> None:
-        """max_upsets: number of upsets to find. conditions: of the games, by default those of the league now."""
+    def __init__(self, registry: Registry, league: LeagueRow, conditions: Conditions | None = None) -> None:
+        """conditions: of the games, by default those of the league now."""
         conditions = conditions or league.conditions
         self._sides = tuple(league.interface.sides)
         self._is_rated_by_side = scoring(league.config, league.interface) == "side" and len(self._sides) > 1
@@ -143,7 +142,7 @@ class CountedGames:
         leaderboard = rank_contestants(results, unrated=self._unrated)
         self._best = [standing.ref for standing in leaderboard[:MOST_CONTESTANTS]]
         ratings = {standing.ref: standing.rating for standing in leaderboard if standing.rating is not None}
-        self._upsets = UpsetFinder(ratings, max_upsets) if max_upsets else None
+        self._upsets = UpsetFinder(ratings, MAX_UPSETS)
         self.games = 0
         self.blocks = 0
         self.matches: list[Match] = []
@@ -168,12 +167,11 @@ class CountedGames:
         return by_side(self._sides, self.matches, self._unrated) if self._is_rated_by_side and self.matches else {}
 
     def greatest_upsets(self) -> list[Upset]:
-        """The least expected games, greatest upset first."""
-        return self._upsets.greatest() if self._upsets else []
+        """At most MAX_UPSETS of the least expected games, greatest upset first."""
+        return self._upsets.greatest()
 
     def _add(self, match: Match) -> None:
-        if self._upsets is not None:
-            self._upsets.see(match)
+        self._upsets.see(match)
         self.blocks += 1
         self.games += len(match.games)
         for game in match.games:

@@ -25,7 +25,6 @@ from league.results.scoring import scoring
 
 MOST_VERDICTS = 60
 """Verdicts with all details, the newest ones."""
-MAX_UPSETS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +80,7 @@ def league_report(
     """Create the report. pictures: whether upsets include images. Raises UnknownLeague."""
     row, versions = registry.leagues.get(league), registry.versions.all(league)
     verdicts, events = registry.verdicts.all(league), registry.aliases.history(league)
-    played = CountedGames(registry, row, MAX_UPSETS)
+    played = CountedGames(registry, row)
     table = played.payoff()
     reported_ids = {verdict.id for verdict in verdicts[-MOST_VERDICTS:]}
     champion = registry.aliases.current(league).get(CHAMPION)

@@ -13,6 +13,7 @@ from typing import Any
 
 from evaluation.matches.leaderboard import CountedGames
 from evaluation.results import iso_timestamp
+from evaluation.statistics.population import shares
 from league.conditions import Conditions, GameChange, game_changes
 from league.registry.registry import Registry
 from league.registry.snapshots import FORMAT, earlier_part
@@ -102,5 +103,6 @@ def tables(played: CountedGames, sides: Sequence[str], not_champion: str | None 
             },
             "not_champion": not_champion,
         },
-        "payoff": payoff.to_json() if payoff else None,
+        "payoff": payoff
+        and payoff.to_json() | {"shares": [share.to_json() for share in shares(payoff, played.matches)]},
     }

@@ -4,9 +4,9 @@
 
 | part | content |
 |---|---|
-| `summary` | counts of games, matches and unique games; scoring, sides and environment; earlier conditions |
+| `summary` | counts of games, matches and unique games; scoring, sides and environment; upsets; earlier conditions |
 | `leaderboard` | `sides`, `leaderboard` (best first), `by_side`, `not_champion` (why not the best version) |
-| `payoff` | payoff matrix of the best contestants; null before the first game |
+| `payoff` | payoff matrix of the best contestants, with `shares` of those that have all met; null without games |
 | `ratings` | `versions`, oldest first |
 | `earlier/<conditions>/leaderboard`, `earlier/<conditions>/payoff` | the same for results under earlier conditions |
 | `verdict/<id>` | a verdict with its evidence; its curve has a few hundred points `[block, LLR]` |
@@ -70,6 +70,7 @@ def documents(registry: Registry, league: str) -> dict[str, Any]:
             "sides": sides,
             "environment": row.config.environment.entry_point,
             "environment_digest": row.environment_digest,
+            "upsets": [upset.to_json() for upset in played.greatest_upsets()],
             "earlier": [results.to_json() for results in earlier_results(registry, row)],
         },
         **tables(played, sides, why_not_champion(registry, league, leaderboard)),

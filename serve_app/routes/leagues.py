@@ -118,6 +118,17 @@ class EarlierGame(Response):
     replaced_at: StoredTime | None
 
 
+class UnexpectedGame(StoredDocument):
+    """A game in which `better` scored `score` against `other`, although the ratings predicted `expected`."""
+
+    match: str = Field(description="`schedule/position`")
+    game: int
+    better: str
+    other: str
+    expected: float
+    score: float
+
+
 class Summary(StoredDocument):
     """Counted games: those of the current game of the league, with its current sides and action selection."""
 
@@ -129,6 +140,7 @@ class Summary(StoredDocument):
     sides: list[str]
     environment: str
     environment_digest: str
+    upsets: list[UnexpectedGame] = Field(description="The games with the least expected results, greatest upset first.")
     earlier: list[EarlierGame] = Field(description="Newest first. They do not count.")
 
 

@@ -101,6 +101,17 @@ class Leaderboard(Response):
     total: int = Field(description="Total number of rows.")
 
 
+class ContestantShares(StoredDocument):
+    """The shares of a contestant in a population, with 95 % intervals."""
+
+    ref: str
+    alpha_rank: float = Field(description="Share of time in an imitating population.")
+    alpha_rank_interval: Interval
+    nash: float = Field(description="Probability in the maximum-entropy equilibrium.")
+    nash_interval: Interval
+    value: float = Field(description="Payoff against the equilibrium, from -1 to 1.")
+
+
 class PayoffMatrix(StoredDocument):
     """A payoff matrix."""
 
@@ -113,6 +124,9 @@ class PayoffMatrix(StoredDocument):
         description="Scores by side: only games in which i alone played this side."
     )
     difference: list[list[Any]] = Field(description="Differences in mean return.")
+    shares: list[ContestantShares] = Field(
+        description="α-Rank and Nash averaging of the contestants that have all met; empty if fewer than three."
+    )
 
 
 class PayoffTable(Response):

@@ -80,6 +80,7 @@ def test_leagues_are_paginated(reader: TestClient) -> None:
 def test_a_league_has_the_time_of_its_standings(reader: TestClient) -> None:
     board = get(reader, BOARD, "League")
     assert (board["summary"]["games"], board["up_to_date"]) == (12, True)
+    assert [upset["better"] for upset in board["summary"]["upsets"]] == ["board@1"]
     assert datetime.fromisoformat(board["computed_at"]) <= datetime.now(UTC)
     assert board["traffic"]["canary"] is None
     memory = get(reader, "/v1/leagues/memory", "League")
@@ -121,7 +122,9 @@ def test_without_snapshots_standings_are_empty(reader: TestClient) -> None:
 
 
 def test_payoff_and_ratings_are_those_of_the_snapshots(reader: TestClient) -> None:
-    assert get(reader, f"{BOARD}/payoff", "PayoffTable")["payoff"]["score"] == [[None, 0.75], [0.25, None]]
+    payoff = get(reader, f"{BOARD}/payoff", "PayoffTable")["payoff"]
+    assert payoff["score"] == [[None, 0.75], [0.25, None]]
+    assert [share["ref"] for share in payoff["shares"]] == ["board@2"]
     assert [each["number"] for each in get(reader, f"{BOARD}/ratings", "Ratings")["versions"]] == [1, 2, 3]
 
 

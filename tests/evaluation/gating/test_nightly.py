@@ -16,7 +16,7 @@ from evaluation.gating import verdicts
 from evaluation.gating.nightly import nightly
 from evaluation.gating.verification import verify
 from evaluation.matches import tournament
-from evaluation.reporting.league_report import league_report
+from evaluation.matches.leaderboard import CountedGames
 from evaluation.results import NightlyReport, Progress, VerdictReport
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -478,8 +478,8 @@ def test_purged_games_are_kept_but_ignored(judged: Registry) -> None:
     assert len(Ledger(judged).results(tictactoe.LEAGUE)) == number - played
     assert len(Ledger(judged).matches(league=tictactoe.LEAGUE, schedule=row.schedule)) >= first.evidence["blocks"]
     assert verify(first.id, registry=judged).outcome == "void"
-    page = league_report(judged, tictactoe.LEAGUE)
-    assert page.games == sum(result.games for result in Ledger(judged).results(tictactoe.LEAGUE))
+    counted = CountedGames(judged, judged.leagues.get(tictactoe.LEAGUE))
+    assert counted.games == sum(result.games for result in Ledger(judged).results(tictactoe.LEAGUE))
 
 
 def test_a_promotion_is_confirmed_by_new_games_of_fixed_number(registry: Registry) -> None:

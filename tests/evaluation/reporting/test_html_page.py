@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from evaluation.matches.leaderboard import MAX_UPSETS
 from evaluation.reporting import html_page as module
 from evaluation.reporting.flipbook import MOST_BYTES, MOST_STEPS
 from evaluation.reporting.html_page import render_page, write
-from evaluation.reporting.league_report import MAX_UPSETS, MOST_VERDICTS, LeagueReport, league_report
+from evaluation.reporting.league_report import MOST_VERDICTS, LeagueReport, league_report
 from evaluation.results import AnchorReport, Confirmation, Difference
 from league.errors import StorageError
 from league.refs import short_verdict

@@ -99,7 +99,7 @@ def test_promotions_have_kind_actor_and_reason(report: LeagueReport) -> None:
 
 def test_upsets_are_games_in_which_the_weaker_contestant_did_better(registry: Registry, report: LeagueReport) -> None:
     ratings = {standing.ref: standing.rating or 0.0 for standing in report.leaderboard}
-    assert 0 < len(report.upsets) <= module.MAX_UPSETS
+    assert 0 < len(report.upsets) <= leaderboard.MAX_UPSETS
     for flipbook in report.upsets:
         game = Ledger(registry).match(flipbook.match).games[flipbook.game]
         assert ratings[flipbook.better] < ratings[flipbook.other]

@@ -1,24 +1,28 @@
-"""Snapshots equal the report of the league, and are recomputed only after changes."""
+"""Snapshots are what the ledger contains, and are recomputed only after changes."""
 
-import json
 import logging
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from evaluation.gating.verdict_evidence import verdict_evidence
 from evaluation.gating.verdicts import open_verdict, void
+from evaluation.matches.game_records import unique_games
+from evaluation.matches.leaderboard import MAX_UPSETS, compute_leaderboard
 from evaluation.matches.tournament import evaluate
-from evaluation.reporting.league_report import LeagueReport, league_report
 from evaluation.service import snapshots
 from evaluation.service.snapshots import documents, refresh, thinned
+from evaluation.statistics.payoff import tabulate
 from league.environments.building import interface
 from league.errors import AlreadyRunning, UnknownLeague
 from league.registry.registry import Registry
 from league.registry.storage.rows import SnapshotRow
+from league.results.ledger import Ledger
 from league.settings import Storage
 from tests.support.leagues import reported_league, tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
@@ -33,14 +37,6 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with reported_league.league_after_nightly(home) as opened:
         refresh(opened, LEAGUE)
     return home
-
-
-@pytest.fixture(scope="module")
-def report(home: Path) -> LeagueReport:
-    registry = Registry.open(Storage.at(home))
-    result = league_report(registry, LEAGUE, pictures=False)
-    registry.close()
-    return result
 
 
 @pytest.fixture
@@ -61,42 +57,74 @@ def times(registry: Registry) -> dict[str, datetime]:
     return {part: snapshot(registry, part).at for part in registry.snapshots.marks(LEAGUE)}
 
 
-def test_snapshots_equal_the_report(registry: Registry, report: LeagueReport) -> None:
-    expected = json.loads(json.dumps(report.to_json()))
-    assert snapshot(registry, "summary").document == {
-        "games": report.games,
-        "matches": report.games // 2,
-        "unique_games": report.unique_games,
+def test_the_summary_counts_the_games_of_the_ledger(registry: Registry) -> None:
+    matches, row = Ledger(registry).matches(league=LEAGUE), registry.leagues.get(LEAGUE)
+    summary = dict(snapshot(registry, "summary").document)
+    upsets = summary.pop("upsets")
+    assert summary == {
+        "games": sum(len(match.games) for match in matches),
+        "matches": len(matches),
+        "unique_games": unique_games(matches),
         "scoring": "game",
         "actions": "greedy",
         "sides": ["player_1", "player_2"],
         "environment": "pettingzoo.classic.tictactoe_v3",
-        "environment_digest": report.environment_digest,
+        "environment_digest": row.environment_digest,
         "earlier": [],
     }
+    ratings = {standing.ref: standing.rating or 0.0 for standing in compute_leaderboard(registry, LEAGUE)}
+    assert 0 < len(upsets) <= MAX_UPSETS
+    for upset in upsets:
+        assert ratings[upset["better"]] < ratings[upset["other"]]
+        assert upset["score"] in Ledger(registry).match(upset["match"]).games[upset["game"]].scores
+
+
+def test_the_leaderboard_and_the_payoffs_are_those_of_the_ledger(registry: Registry) -> None:
+    matches = Ledger(registry).matches(league=LEAGUE)
+    expected = [
+        replace(standing, unique_games=unique_games(matches, standing.ref)).to_json()
+        for standing in compute_leaderboard(registry, LEAGUE)
+    ]
     assert snapshot(registry, "leaderboard").document == {
         "sides": ["player_1", "player_2"],
-        "leaderboard": expected["leaderboard"],
+        "leaderboard": expected,
         "by_side": {},
-        "not_champion": expected["not_champion"],
+        "not_champion": None,
     }
-    assert snapshot(registry, "payoff").document == expected["payoff"]
-    assert snapshot(registry, "ratings").document == {"versions": expected["versions"]}
-    assert registry.snapshots.marks(LEAGUE).keys() == PARTS | {
-        f"verdict/{verdict.verdict}" for verdict in report.verdicts
-    }
-    for verdict in expected["verdicts"]:
-        verdict["curve"] = [[block, llr] for block, llr in enumerate(verdict["curve"], start=1)]
-        assert snapshot(registry, f"verdict/{verdict['verdict']}").document == verdict
+    refs = [standing["ref"] for standing in expected]
+    payoff = dict(snapshot(registry, "payoff").document)
+    shares = payoff.pop("shares")
+    assert payoff == tabulate(refs, ["player_1", "player_2"], matches).to_json()
+    assert {share["ref"] for share in shares} == set(refs), "a round robin has all pairs"
+    assert sum(share["nash"] for share in shares) == pytest.approx(1)
+    versions = snapshot(registry, "ratings").document["versions"]
+    assert [version["number"] for version in versions] == [1, 2, 3]
+    ratings = {standing["ref"]: standing["rating"] for standing in expected}
+    assert [version["rating"] for version in versions] == [ratings[version["ref"]] for version in versions]
+    assert [len(version["champion_at"]) for version in versions] == [1, 1, 2], "a rollback promotes version 3 again"
 
 
-def test_a_rollback_changes_why_the_best_version_is_not_champion_as_in_the_report(registry: Registry) -> None:
+def test_each_verdict_has_its_evidence(registry: Registry) -> None:
+    rows, events = registry.verdicts.all(LEAGUE), registry.aliases.history(LEAGUE)
+    assert registry.snapshots.marks(LEAGUE).keys() == PARTS | {f"verdict/{row.id}" for row in rows}
+    for row in rows:
+        evidence = verdict_evidence(registry, row, events).to_json()
+        assert row.evidence is not None
+        assert (evidence["outcome"], evidence["promoted"]) == (row.outcome, row.evidence["promoted"])
+        assert (evidence["llr"], evidence["blocks"]) == (row.evidence["llr"], row.evidence["blocks"])
+        assert evidence["counts"] == row.evidence["counts"]
+        evidence["curve"] = [[block, llr] for block, llr in enumerate(evidence["curve"], start=1)]
+        assert snapshot(registry, f"verdict/{row.id}").document == evidence
+    reasons = [snapshot(registry, f"verdict/{row.id}").document["reason"] for row in rows]
+    assert reasons[0].startswith("Not stronger: ")
+    assert reasons[-1].startswith("Stronger: ")
+
+
+def test_a_rollback_changes_why_the_best_version_is_not_champion(registry: Registry) -> None:
     assert snapshot(registry, "leaderboard").document["not_champion"] is None
     registry.aliases.rollback(LEAGUE, actor="ada", reason="it was slow")
     refresh(registry, LEAGUE)
-    explanation = snapshot(registry, "leaderboard").document["not_champion"]
-    assert "it was rolled back" in explanation
-    assert explanation == league_report(registry, LEAGUE, pictures=False).not_champion
+    assert "it was rolled back" in snapshot(registry, "leaderboard").document["not_champion"]
 
 
 def test_current_snapshots_are_not_recomputed(registry: Registry) -> None:
@@ -137,12 +165,14 @@ def test_a_verdict_is_recomputed_until_it_is_closed_and_when_voided(registry: Re
 
 
 def test_purged_games_are_ignored(registry: Registry) -> None:
-    games, verdict = snapshot(registry, "summary").document["games"], registry.verdicts.all(LEAGUE)[0]
+    verdict = registry.verdicts.all(LEAGUE)[0]
+    ledger = Ledger(registry)
+    matches = [match for schedule in verdict.schedules for match in ledger.matches(league=LEAGUE, schedule=schedule)]
+    games = snapshot(registry, "summary").document["games"]
     void(registry, verdict.id, actor="ada", reason="another machine's", purge=True)
     refresh(registry, LEAGUE)
     summary = snapshot(registry, "summary").document
-    report = league_report(registry, LEAGUE, pictures=False)
-    assert summary["games"] == report.games < games
+    assert summary["games"] == games - sum(len(match.games) for match in matches) < games
     assert snapshot(registry, f"verdict/{verdict.id}").document["outcome"] == "void"
 
 

@@ -138,6 +138,16 @@ def snapshots() -> dict[str, Any]:
             "sides": ["player_0", "player_1"],
             "environment": "games.none:none",
             "environment_digest": "0" * 64,
+            "upsets": [
+                {
+                    "match": f"{SCHEDULE.id}/1",
+                    "game": 0,
+                    "better": "board@1",
+                    "other": "board@2",
+                    "expected": 0.1,
+                    "score": 1,
+                }
+            ],
             "earlier": [
                 {
                     "name": EARLIER,
@@ -160,6 +170,16 @@ def snapshots() -> dict[str, Any]:
             "games": [[0, 4], [4, 0]],
             "by_side": {},
             "difference": [[None, {"mean": 0.5, "low": None, "high": None}], [None, None]],
+            "shares": [
+                {
+                    "ref": "board@2",
+                    "alpha_rank": 0.9,
+                    "alpha_rank_interval": [0.5, 1.0],
+                    "nash": 1.0,
+                    "nash_interval": [0.7, 1.0],
+                    "value": 0.0,
+                }
+            ],
         },
         f"earlier/{EARLIER}/leaderboard": {"sides": [], "leaderboard": leaderboard[1:2], "by_side": {}},
         f"earlier/{EARLIER}/payoff": None,
