@@ -1,1 +1,1 @@
-"""Reports of a league: HTML page, JSON document, charts and webhook."""
+"""What the gate has found out about versions, comparisons of training runs, and the webhook."""

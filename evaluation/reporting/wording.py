@@ -1,4 +1,4 @@
-"""Tests of a verdict in words, for the command line and the report."""
+"""Tests of a verdict in words, for the command line."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-// JSON requests to the server, with retries and the API key that the user entered. The key is kept in sessionStorage only.
+// JSON requests to the server, with retries and the API key that the user entered. The key is kept in sessionStorage only. In a report, its data answers.
 
 import { heard, unanswered } from "./connection.js";
+import { documentOf, report } from "./report.js";
 import { ROOT } from "./router.js";
 
 const MAX_ATTEMPTS = 4;
@@ -19,7 +20,7 @@ export class ApiError extends Error {
 const KEY = `key${ROOT}`; // other servers of the same origin, below other prefixes, have keys of their own
 
 export const key = {
-  get: () => sessionStorage.getItem(KEY),
+  get: () => (report ? null : sessionStorage.getItem(KEY)),
   set(text) {
     if (text) sessionStorage.setItem(KEY, text);
     else sessionStorage.removeItem(KEY);
@@ -47,6 +48,7 @@ function newKey(message) {
  * Repeatable requests are retried while the server is busy. Other requests carry an idempotency key, so they are applied once.
  */
 export async function request(path, { method = "GET", body, signal, raw = false, repeatable = method === "GET" } = {}) {
+  if (report) return reported(path);
   const headers = { accept: raw ? "*/*" : "application/json" };
   if (body !== undefined) headers["content-type"] = "application/json";
   if (!repeatable) headers["idempotency-key"] = randomId();
@@ -70,6 +72,13 @@ export async function request(path, { method = "GET", body, signal, raw = false,
       await pause(Math.min(MAX_RETRY_DELAY, error.retryAfter ?? 300 * 2 ** attempt), signal);
     }
   }
+}
+
+/** The document of a path in the report. Throws ApiError if there is none, or if the server would have responded with an error. */
+function reported(path) {
+  const found = documentOf(path) ?? { code: "not_found", message: "This report does not contain it." };
+  if (found.code) throw new ApiError(404, found.code, found.message);
+  return found;
 }
 
 /** Whether a retry may succeed: the server is starting, restarting or busy. */

@@ -8,7 +8,8 @@ import { League } from "./league.js";
 import { Leagues } from "./leagues.js";
 import { Dialog, Form, Notifications, sentence } from "./components.js";
 import { clock } from "./format.js";
-import { followLinks, keepPositions, matchRoute, ROOT, useAddress } from "./router.js";
+import { Live } from "./report.js";
+import { followLinks, HOME, keepPositions, matchRoute, ROOT, useAddress } from "./router.js";
 
 const THEMES = ["system", "light", "dark"];
 /** The filled part of the theme icon. */
@@ -36,11 +37,13 @@ function App() {
   return html`
     <a class="skip-link" href="#main" onClick=${(event) => { event.preventDefault(); main.current.focus(); }}>Skip to content</a>
     <header class="header">
-      <a class="brand" href="${ROOT}/"><img src="${ROOT}/pages/logo.svg" alt="" width="24" height="24" /><span>Policy League</span></a>
-      <nav aria-label="Documentation"><a href="${ROOT}/docs">API</a></nav>
+      <a class="brand" href=${HOME}><img src=${icon.href} alt="" width="24" height="24" /><span>Policy League</span></a>
+      <${Live}><nav aria-label="Documentation"><a href="${ROOT}/docs">API</a></nav><//>
       <${Theme} />
-      <${KeyButton} isPrompting=${!!prompt} onClick=${() => setPrompt({ message: "", done: () => {}, reloads: true })} />
-      <${ServerNotice} />
+      <${Live}>
+        <${KeyButton} isPrompting=${!!prompt} onClick=${() => setPrompt({ message: "", done: () => {}, reloads: true })} />
+        <${ServerNotice} />
+      <//>
     </header>
     <main id="main" tabindex="-1" ref=${main} key=${generation}>
       ${isLeagues ? html`<${Leagues} />` : html`<${League} path=${path} />`}

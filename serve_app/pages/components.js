@@ -3,6 +3,7 @@
 import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { count, dateTime, fullDateTime, OUTCOMES, plural, STATES, timeAgo } from "./format.js";
 import { useTicks } from "./data.js";
+import { report } from "./report.js";
 import { ROOT } from "./router.js";
 
 /** The page path of a league, or of something in it. */
@@ -39,11 +40,11 @@ export function EmptyState({ children }) {
   return html`<p class="empty muted">${children}</p>`;
 }
 
-/** A relative time, or the date; the full time is in the tooltip. */
+/** A relative time, or the date, as always in a report; the full time is in the tooltip. */
 export function Time({ at, date }) {
   useTicks(10000);
   if (!at) return html`<span class="muted">–</span>`;
-  return html`<time datetime=${at} title=${fullDateTime(at)}>${date ? dateTime(at) : timeAgo(at)}</time>`;
+  return html`<time datetime=${at} title=${fullDateTime(at)}>${date || report ? dateTime(at) : timeAgo(at)}</time>`;
 }
 
 export function Badge({ tone = "plain", sign, children }) {

@@ -4,6 +4,7 @@ import { createContext, useCallback, useContext, useEffect, useRef, useState } f
 import { ApiError, isTemporary, key, query, request } from "./api.js";
 import { onBack } from "./connection.js";
 import { follow } from "./events.js";
+import { report } from "./report.js";
 import { remember } from "./router.js";
 
 const PAGE = 50;
@@ -80,7 +81,7 @@ function useLoaded(path, token, load, every = null) {
   useEffect(() => {
     const isFailed = state.error instanceof ApiError && isTemporary(state.error, true);
     const delay = isFailed ? RETRY_DELAY : state.error ? null : every;
-    if (!delay) return undefined;
+    if (!delay || report) return undefined;
     let timer = null;
     const wait = () => { timer = setTimeout(() => (document.hidden ? wait() : retry()), delay); };
     wait();
@@ -102,7 +103,7 @@ export function useMissingScope(scope, league) {
 export function useEvents(path, onEvent, isLast) {
   const latest = useRef(onEvent);
   latest.current = onEvent;
-  useEffect(() => (path ? follow(path, (name, data) => latest.current(name, data), { isLast }) : undefined), [path]);
+  useEffect(() => (path && !report ? follow(path, (name, data) => latest.current(name, data), { isLast }) : undefined), [path]);
 }
 
 /** The newest `league` event. Its fields change whenever the corresponding data of the league changes. */

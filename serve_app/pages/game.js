@@ -6,7 +6,8 @@ import { hasOneSide } from "./data.js";
 import { useKeys } from "./keyboard.js";
 import { Await, ErrorNotice, leaguePath, notify, Properties, useTitle } from "./components.js";
 import { describe, Moves, Picture } from "./step.js";
-import { navigate, useAddress } from "./router.js";
+import { Live, report } from "./report.js";
+import { currentURL, navigate, useAddress } from "./router.js";
 import { number, plural, shortRef } from "./format.js";
 
 const PAGE = 50;
@@ -18,8 +19,8 @@ export function Game({ league, schedule, position, game, about }) {
   const players = recording && [...new Set(Object.values(recording.players))];
   useTitle(players?.map(shortRef).join(hasOneSide(about) ? " and " : " against "), league);
   return html`<section aria-labelledby="heading">
-    <p class="crumbs"><a href=${leaguePath(league, "matches", schedule, position)}>Match</a></p>
-    <div class="head"><h2 id="heading">Game ${game}</h2>${recording && !recording.fault && html`<${DownloadGif} path=${path} name="${league}-${schedule}-${position}-${game}.gif" />`}</div>
+    <p class="crumbs">${report ? html`<a href=${leaguePath(league, "upsets")}>Upsets</a>` : html`<a href=${leaguePath(league, "matches", schedule, position)}>Match</a>`}</p>
+    <div class="head"><h2 id="heading">Game ${game}</h2>${recording && !recording.fault && html`<${Live}><${DownloadGif} path=${path} name="${league}-${schedule}-${position}-${game}.gif" /><//>`}</div>
     <${Await} result=${{ data: recording, error, retry: () => loadFrom(0) }} message="Replaying the game …">${recording && (recording.fault
       ? html`<${ErrorNotice} error=${{ message: recording.fault }} />`
       : html`<${Player} recording=${recording} loadFrom=${loadFrom} />`)}<//>
@@ -48,9 +49,11 @@ const byNumber = (steps) => Object.fromEntries(steps.map((step) => [step.step, s
 
 function Player({ recording, loadFrom }) {
   const { fragment } = useAddress();
-  const last = recording.length;
-  const names = recording.action_names;
-  const clamped = (step) => Math.min(last, Math.max(0, Math.floor(Number(step)) || 0));
+  const { length: last, every, action_names: names } = recording;
+  const clamped = (step) => {
+    const wanted = Math.max(0, Math.floor(Number(step)) || 0);
+    return wanted >= last ? last : wanted - (wanted % every);
+  };
   const [at, setAt] = useState(() => clamped(fragment));
   const written = useRef(fragment);
   const [isPlaying, setIsPlaying] = useState(false);
@@ -60,17 +63,17 @@ function Player({ recording, loadFrom }) {
   const toggle = () => { if (!isPlaying && at === last) setAt(0); setIsPlaying(!isPlaying); };
   useEffect(() => { loadFrom(at); if (at + PAGE / 2 <= last) loadFrom(at + PAGE / 2); written.current = String(at); navigate(`#${at}`, { replace: true }); }, [at]);
   useEffect(() => {
-    const now = location.hash.slice(1); // `fragment` may be older than what was written
+    const now = currentURL().hash.slice(1); // `fragment` may be older than what was written
     if (now !== written.current) move(now); // the user has changed the address
   }, [fragment]);
   useEffect(() => {
     if (!isPlaying || !step) return undefined; // waits until the step is loaded
     if (at === last) { setIsPlaying(false); return undefined; }
-    const timer = setTimeout(() => setAt(at + 1), (last > 60 ? 250 : 800) / speed);
+    const timer = setTimeout(() => setAt(clamped(at + every)), (last / every > 60 ? 250 : 800) / speed);
     return () => clearTimeout(timer);
   }, [isPlaying, at, speed, !!step]);
   useKeys((key) => {
-    const action = { " ": toggle, ArrowLeft: () => move(at - 1), ArrowRight: () => move(at + 1), Home: () => move(0), End: () => move(last),
+    const action = { " ": toggle, ArrowLeft: () => move(at - 1), ArrowRight: () => move(at + every), Home: () => move(0), End: () => move(last),
       "+": () => setSpeed(otherSpeed(speed, 1)), "-": () => setSpeed(otherSpeed(speed, -1)) }[key];
     action?.();
     return !!action;
@@ -82,7 +85,7 @@ function Player({ recording, loadFrom }) {
         <button type="button" onClick=${() => move(0)} aria-label="First step"><${Icon} path="M2 2h2v10H2zM12 2v10L5 7z" /></button>
         <button type="button" onClick=${() => move(at - 1)} aria-label="Previous step"><${Icon} path="M11 2v10L3 7z" /></button>
         <button type="button" class="primary" onClick=${toggle}>${isPlaying ? "Pause" : "Play"}</button>
-        <button type="button" onClick=${() => move(at + 1)} aria-label="Next step"><${Icon} path="M3 2v10l8-5z" /></button>
+        <button type="button" onClick=${() => move(at + every)} aria-label="Next step"><${Icon} path="M3 2v10l8-5z" /></button>
         <button type="button" onClick=${() => move(last)} aria-label="Last step"><${Icon} path="M10 2h2v10h-2zM2 2v10l7-5z" /></button>
         <label class="inline">Speed <select value=${speed} onChange=${(event) => setSpeed(Number(event.target.value))}>${SPEEDS.map((each) => html`<option value=${each}>${each} ×</option>`)}</select></label>
       </div>
@@ -92,6 +95,7 @@ function Player({ recording, loadFrom }) {
     </div>
     <div class="game-info" aria-live=${isPlaying ? "off" : "polite"}>
       <h3>${step ? (at === 0 ? "Start" : `Step ${at}`) : "Loading …"}${at === last ? " · end" : ""}</h3>
+      ${every > 1 && html`<p class="muted small">One in ${every} steps is shown.</p>`}
       <${Moves} step=${step} names=${names} />
       <${Players} recording=${recording} isOver=${at === last} />
       <p class="muted small keys"><kbd>Space</kbd> play or pause, <kbd>←</kbd> <kbd>→</kbd> previous or next step, <kbd>Home</kbd> <kbd>End</kbd> first or last step, <kbd>+</kbd> <kbd>−</kbd> speed</p>

@@ -4,6 +4,7 @@ import { html, useState } from "./vendor/preact-htm.js";
 import { apiPath, query } from "./api.js";
 import { useChangeToken, useData, useList } from "./data.js";
 import { Await, EmptyState, leaguePath, LongText, ShowMore, Table, Time } from "./components.js";
+import { Live } from "./report.js";
 
 export function History({ league, about }) {
   const aliases = [...new Set(["champion", ...Object.keys(about.aliases ?? {})])];
@@ -14,7 +15,7 @@ export function History({ league, about }) {
       ${aliases.length > 1 && html`<label class="inline">Alias <select value=${alias} onChange=${(event) => setAlias(event.target.value)}>
         ${aliases.map((each) => html`<option value=${each}>${each}</option>`)}</select></label>`}
     </div>
-    <${VersionAt} league=${league} alias=${alias} />
+    <${Live}><${VersionAt} league=${league} alias=${alias} /><//>
     <${Await} result=${events}>${events.items && (events.items.length
       ? html`<${Table} caption="History of ${alias}, newest first" head=${[["Time"], ["Version"], ["Previous"], ["Change"], ["By"], ["Reason"]]} cls="full">
           ${events.items.map((each) => html`<${Row} key=${each.event} league=${league} event=${each} />`)}<//>`

@@ -5,6 +5,7 @@ import { apiPath, query } from "./api.js";
 import { useChangeToken, useOffsetList } from "./data.js";
 import { Await, EmptyState, leaguePath, Ref, ShowMore, Table } from "./components.js";
 import { EarlierResults } from "./earlier.js";
+import { Live } from "./report.js";
 import { Term } from "./term.js";
 import { useAddress } from "./router.js";
 import { count, interval, number, percent, plural, signed } from "./format.js";
@@ -32,7 +33,7 @@ export function Leaderboard({ league, about }) {
 function Rows({ league, rows, champion, isComputed }) {
   if (!rows.length) {
     return html`<${EmptyState}>${isComputed
-      ? html`No games yet. <a href=${leaguePath(league, "evaluations", "new")}>Start an evaluation</a> to rate the versions.`
+      ? html`No games yet. <${Live}><a href=${leaguePath(league, "evaluations", "new")}>Start an evaluation</a> to rate the versions.<//>`
       : "The leaderboard has not been computed yet. The evaluation service computes it a few seconds after new games."}<//>`;
   }
   const hasReturn = rows.some((row) => row.mean_return != null);

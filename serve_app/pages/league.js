@@ -14,26 +14,30 @@ import { Nights } from "./nights.js";
 import { Payoff } from "./payoff.js";
 import { Play } from "./play.js";
 import { Promotions } from "./promotion.js";
-import { matchRoute, ROOT } from "./router.js";
+import { Live, report } from "./report.js";
+import { HOME, matchRoute } from "./router.js";
 import { Run, Runs } from "./runs.js";
 import { Leaderboard } from "./leaderboard.js";
 import { Traffic } from "./traffic.js";
+import { Upsets } from "./upsets.js";
 import { Verdict, Verdicts } from "./verdicts.js";
 import { Versions } from "./versions.js";
-import { count, mixture, rate } from "./format.js";
+import { count, dateTime, mixture, rate } from "./format.js";
 
-const TABS = [
+const PAGES = [
   ["Leaderboard", "", Leaderboard],
   ["Payoff matrix", "payoff", Payoff],
+  ["Upsets", "upsets", Upsets],
   ["Versions", "versions", Versions],
   ["Verdicts", "verdicts", Verdicts],
   ["History", "history", History],
-  ["Traffic", "traffic", Traffic],
-  ["Evaluations", "evaluations", Evaluations],
-  ["Training", "training", Runs],
-  ["Nights", "nights", Nights],
-  ["Play", "play", Play],
+  ["Traffic", "traffic", Traffic, "live"],
+  ["Evaluations", "evaluations", Evaluations, "live"],
+  ["Training", "training", Runs, "live"],
+  ["Nights", "nights", Nights, "live"],
+  ["Play", "play", Play, "live"],
 ];
+const TABS = PAGES.filter(([, , , live]) => !(report && live)); // a report has results only
 
 const REFRESH_INTERVAL = 5000;
 const LEAGUE = "/leagues/:league";
@@ -59,7 +63,7 @@ export function League({ path }) {
 function NotFound({ path }) {
   useTitle("Not found");
   return html`<div class="title"><h1>Page not found</h1></div>
-    <${EmptyState}>There is no page at <code>${path}</code>. <a href="${ROOT}/">Show all leagues</a><//>`;
+    <${EmptyState}>There is no page at <code>${path}</code>. <a href=${HOME}>${report ? "Show the leaderboard" : "Show all leagues"}</a><//>`;
 }
 
 function KnownLeague({ league, route, parameters }) {
@@ -69,15 +73,15 @@ function KnownLeague({ league, route, parameters }) {
   useTitle(route.name, league);
   if (about.error?.status === 404 || about.error?.status === 400) {
     return html`<div class="title"><h1>League <q>${league}</q> not found</h1></div>
-      <${EmptyState}>${sentence(about.error.message)} <a href="${ROOT}/">Show all leagues</a><//>`;
+      <${EmptyState}>${sentence(about.error.message)} <a href=${HOME}>Show all leagues</a><//>`;
   }
   const Page = route.page;
   return html`<${LeagueState.Provider} value=${state}>
     <div class="title">
-      <p class="crumbs"><a href="${ROOT}/">Leagues</a></p>
+      <p class="crumbs">${report ? html`<span class="muted">Report of ${dateTime(report.made_at)}</span>` : html`<a href=${HOME}>Leagues</a>`}</p>
       <h1>${league}</h1>
       ${about.data && html`<${TrafficBadges} about=${about.data} />`}
-      ${about.data && html`<${Promotions} league=${league} champion=${about.data.champion} />`}
+      ${about.data && html`<${Live}><${Promotions} league=${league} champion=${about.data.champion} /><//>`}
     </div>
     <${Await} result=${about}>${about.data && !route.isCompact && html`<${Summary} about=${about.data} isFirst=${route.tab === ""} />`}<//>
     <${Tabs} league=${league} route=${route} />
@@ -114,8 +118,8 @@ function Summary({ about, isFirst }) {
       ["Environment", html`<span class="path">${about.environment}</span>`, "name"],
       ["Games", count(summary?.games)],
       ["Unique games", count(summary?.unique_games)],
-      about.requests_per_second != null && ["Requests/s", rate(about.requests_per_second)],
-      ["Last updated", html`<span class="nowrap"><${Time} at=${about.computed_at} /></span>${about.computed_at && !about.up_to_date && html`<small>updating</small>`}`],
+      !report && about.requests_per_second != null && ["Requests/s", rate(about.requests_per_second)],
+      !report && ["Last updated", html`<span class="nowrap"><${Time} at=${about.computed_at} /></span>${about.computed_at && !about.up_to_date && html`<small>updating</small>`}`],
     ]} cls=${isFirst ? "" : "aside"} />
     ${faults.length > 0 && html`<div class="notice bad" role="alert"><p><strong>A replica does not serve the expected version.</strong></p>
       <ul>${faults.map((fault) => html`<li>${fault}</li>`)}</ul></div>`}`;

@@ -3,12 +3,13 @@
 import { html } from "./vendor/preact-htm.js";
 import { apiPath, request } from "./api.js";
 import { Dialog, Form, LongText, notify, Time } from "./components.js";
+import { Live } from "./report.js";
 
 /** The note in the list of versions, with a button to add or edit it. */
 export function Note({ note, name, edit, disabledReason }) {
   return html`${note && html`<span title="${note.actor}"><${LongText}>${note.text}<//></span> `}
-    <button type="button" class="small" onClick=${edit} disabled=${disabledReason} title=${disabledReason} aria-label="${note ? "Edit the note of" : "Add a note to"} ${name}">
-      ${note ? "Edit …" : "Add …"}</button>`;
+    <${Live}><button type="button" class="small" onClick=${edit} disabled=${disabledReason} title=${disabledReason} aria-label="${note ? "Edit the note of" : "Add a note to"} ${name}">
+      ${note ? "Edit …" : "Add …"}</button><//>`;
 }
 
 export function EditNote({ league, version, note, onClose }) {

@@ -1,17 +1,27 @@
 // Client-side routing: links between pages change the address without reloading the document.
 
 import { useLayoutEffect, useState } from "./vendor/preact-htm.js";
+import { report } from "./report.js";
 
-/** The path below which the server is: empty, or the prefix of a proxy (`/ai`). */
-export const ROOT = new URL("..", import.meta.url).pathname.slice(0, -1);
+/** The path below which the server is: empty, or the prefix of a proxy (`/ai`). In a report, which is one file, the fragment contains addresses. */
+export const ROOT = report ? "#" : new URL("..", import.meta.url).pathname.slice(0, -1);
+
+/** Where all pages start. */
+export const HOME = report ? `#/leagues/${report.league}` : `${ROOT}/`;
+
+/** The address of the current page. */
+export const currentURL = () => (report ? new URL((location.hash || HOME).slice(1), "file:///") : new URL(location.href));
 
 const NAVIGATED = "league:navigated";
 
 /** Navigate to another address. `replace`: replace the current history entry. */
 export function navigate(address, { replace = false } = {}) {
-  const isOtherPage = new URL(address, location.href).pathname !== location.pathname;
-  if (replace) history.replaceState(history.state, "", address);
-  else history.pushState(null, "", address);
+  const current = currentURL();
+  const target = new URL(address, current);
+  const isOtherPage = target.pathname !== current.pathname;
+  const written = report ? `#${target.pathname}${target.search}${target.hash}` : target;
+  if (replace) history.replaceState(history.state, "", written);
+  else history.pushState(null, "", written);
   if (isOtherPage) scrollTo(0, 0);
   dispatchEvent(new Event(NAVIGATED));
 }
@@ -68,7 +78,8 @@ export function useAddress() {
 }
 
 function currentAddress() {
-  return { path: location.pathname.slice(ROOT.length), parameters: new URLSearchParams(location.search), fragment: location.hash.slice(1) };
+  const { pathname, searchParams, hash } = currentURL();
+  return { path: report ? pathname : pathname.slice(ROOT.length), parameters: searchParams, fragment: hash.slice(1) };
 }
 
 /** Handle clicks on links to these pages. The browser handles other links, downloads and clicks that open a new tab. */

@@ -5,6 +5,7 @@ import { apiPath, query } from "./api.js";
 import { Chart, DataTable } from "./chart.js";
 import { hasOneSide, useChangeToken, useData, useList } from "./data.js";
 import { Await, EmptyState, leaguePath, Outcome, Properties, ShowMore, Table, Time, useTitle } from "./components.js";
+import { Live, report } from "./report.js";
 import { Term } from "./term.js";
 import { count, interval, number, percent, shortRef, shortVerdict, signed } from "./format.js";
 
@@ -17,8 +18,8 @@ export function Verdicts({ league }) {
     <${Await} result=${verdicts}>${verdicts.items && (verdicts.items.length
       ? html`<${Table} caption="Verdicts, newest first" head=${head} cls="full">
           ${verdicts.items.map((each) => html`<${Row} key=${each.verdict} league=${league} verdict=${each} />`)}<//>`
-      : html`<${EmptyState}>No verdicts yet. Run <code>league nightly</code> or
-          <a href=${leaguePath(league, "evaluations", "new")}>start a nightly run</a> to test new versions.<//>`)}<//>
+      : html`<${EmptyState}>No verdicts yet. Run <code>league nightly</code> <${Live}>or
+          <a href=${leaguePath(league, "evaluations", "new")}>start a nightly run</a> <//>to test new versions.<//>`)}<//>
     <${ShowMore} list=${verdicts} />
   </section>`;
 }
@@ -47,7 +48,7 @@ export function Verdict({ league, verdict, about }) {
       ${loaded.reason && html`<p class="lead">${loaded.reason}</p>`}
       ${loaded.remedy && html`<p>${loaded.remedy}</p>`}
       ${loaded.earlier_game && html`<div class="notice" role="status"><p><strong>The game of this league has changed since.</strong> These games count in no current rating.</p>
-        <a href=${query(leaguePath(league), { game: loaded.earlier_game })}>Show the results of that game</a></div>`}
+        <${Live}><a href=${query(leaguePath(league), { game: loaded.earlier_game })}>Show the results of that game</a><//></div>`}
       <${Evidence} verdict=${loaded} />
       <${Statistics} league=${league} verdict=${loaded} />
       ${loaded.anchors?.length > 0 && html`<${Anchors} anchors=${loaded.anchors} />`}
@@ -77,7 +78,7 @@ function Statistics({ league, verdict }) {
   const difference = verdict.difference;
   return html`<${Properties} items=${[
       ["Verdict", html`<code>${shortVerdict(verdict.verdict)}</code>`],
-      ["Games", html`<a href=${query(leaguePath(league, "matches"), { first: verdict.candidate, second: verdict.opponent })}>${count(verdict.games)}</a>`],
+      ["Games", report ? count(verdict.games) : html`<a href=${query(leaguePath(league, "matches"), { first: verdict.candidate, second: verdict.opponent })}>${count(verdict.games)}</a>`],
       verdict.unique_games != null && ["Unique games", count(verdict.unique_games)],
       [html`<${Term} name="block">Blocks<//>`, count(verdict.blocks)],
       ["Score", percent(verdict.score)],

@@ -7,6 +7,7 @@ import { useChangeToken, useData, useList, useMissingScope } from "./data.js";
 import { EditNote, Note } from "./note.js";
 import { Await, Badge, EmptyState, Ref, ShowMore, Table, Time } from "./components.js";
 import { canBePromoted, Promote } from "./promotion.js";
+import { Live } from "./report.js";
 import { count, interval, mixture, plural, short, signed } from "./format.js";
 
 export function Versions({ league, about }) {
@@ -63,7 +64,7 @@ function Row({ league, version: each, rated, champion, promote, edit, disabledRe
     <td>${each.parent == null ? html`<span class="muted">–</span>` : `@${each.parent}`}</td>
     <td class="nowrap"><${Time} at=${each.created_at} /></td>
     <td class="wrap"><${Note} note=${each.note} name="${league}@${each.version}" edit=${() => edit(each)} disabledReason=${disabledReason} /></td>
-    <td>${each.version !== champion && canBePromoted(each) && html`<button type="button" class="small" onClick=${() => promote(each.version)} disabled=${disabledReason} title=${disabledReason}
-      aria-label="Promote ${league}@${each.version}">Promote …</button>`}</td>
+    <td>${each.version !== champion && canBePromoted(each) && html`<${Live}><button type="button" class="small" onClick=${() => promote(each.version)} disabled=${disabledReason} title=${disabledReason}
+      aria-label="Promote ${league}@${each.version}">Promote …</button><//>`}</td>
   </tr>`;
 }

@@ -1,13 +1,11 @@
 """Each page with real results: expected texts, accessibility, light and dark theme, phone width."""
 
 import re
-from typing import Any
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
-from tests.support.clients.browsers import Served, Tab
+from tests.support.clients.browsers import Served, Tab, serious
 from tests.support.leagues.browser_leagues import CONNECT_FOUR, EMPTY, NAMED, RUN, verdict_between_versions
 from tests.support.leagues.tictactoe import LEAGUE
 
@@ -19,7 +17,8 @@ PAGES = {
     "/leagues": (r"connect_four",),
     L: (r"tictactoe@3\s*★\s*champion", r"script:random", r"95 % interval"),
     f"/leagues/{EMPTY}": (r"Champion\s*none", r"The leaderboard has not been computed yet|No games yet"),
-    f"{L}/payoff": (r"always wins", r"script:random"),
+    f"{L}/payoff": (r"always wins", r"script:random", r"α-Rank and Nash averaging.*script:random"),
+    f"{L}/upsets": (r"Did better than", r"script:random"),
     f"{L}/versions": (r"tictactoe@1", r"became champion", r"Promote …"),
     f"{L}/verdicts": (r"▲ promote", r"@2"),
     f"{L}/verdicts/{{verdict}}": (r"tictactoe@\d against", r"Stronger: ", r"Blocks by result"),
@@ -71,31 +70,18 @@ def test_a_page(tab: Tab, names: dict[str, str], path: str) -> None:
         expect(page.locator("body")).to_contain_text(re.compile(words))
     expect(page.locator("h1")).to_have_count(1)
     assert page.title().endswith("Policy League")
-    assert serious(tab) == []
+    assert serious(tab.page) == []
     page.set_viewport_size({"width": 360, "height": 740})
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (
         "the page scrolls horizontally on a phone"
     )
 
 
-def serious(tab: Tab) -> list[dict[str, Any]]:
-    """The serious and critical violations that axe finds."""
-    found = Axe().run(tab.page).response["violations"]
-    return [
-        {
-            "rule": each["id"],
-            "at": [node["html"][:200] + str(node.get("failureSummary"))[:300] for node in each["nodes"]],
-        }
-        for each in found
-        if each["impact"] in ("serious", "critical")
-    ]
-
-
 def test_a_dialog(tab: Tab) -> None:
     page = tab.open(L)
     page.get_by_role("button", name="Roll back …").click()
     expect(page.get_by_role("dialog")).to_contain_text(re.compile(r"becomes champion again and replaces\s+tictactoe@"))
-    assert serious(tab) == []
+    assert serious(tab.page) == []
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_have_count(0)
     expect(page.get_by_role("button", name="Roll back …")).to_be_focused()
@@ -105,7 +91,7 @@ def test_the_note_dialog(tab: Tab) -> None:
     page = tab.open(f"{L}/versions")
     page.get_by_role("button", name=f"Edit the note of {LEAGUE}@2").click()
     expect(page.get_by_role("dialog", name=f"Note of {LEAGUE}@2")).to_contain_text("Save an empty note to delete it")
-    assert serious(tab) == []
+    assert serious(tab.page) == []
 
 
 def test_results_of_an_earlier_game(tab: Tab) -> None:
@@ -115,7 +101,7 @@ def test_results_of_an_earlier_game(tab: Tab) -> None:
     page.get_by_role("link", name="2 matches").click()
     expect(page.get_by_role("row", name=re.compile("script:one_ply"))).to_be_visible()
     expect(page.get_by_text("These are results of an earlier game")).to_be_visible()
-    assert serious(tab) == []
+    assert serious(tab.page) == []
     page.get_by_role("link", name="Show current results").click()
     expect(page.get_by_text("No games yet")).to_be_visible()
 

@@ -19,6 +19,7 @@ from league.errors import (
 from league.files import disk_errors
 from league.refs import check_slug
 from league.settings import Storage
+from policy_league.cli.evaluation.report import write_report
 from policy_league.cli.interrupt import exit_on_interrupt
 from policy_league.cli.options import CORES, AsJson, ClusterWorkers, EvaluationCluster, open_registry, workers_for
 from policy_league.cli.output import GameProgress, complain, console, difference, emit, say, show_leaderboard
@@ -180,13 +181,11 @@ def run_nightly(config: "LeagueConfig", workers: int | None = CORES, quiet: bool
 def _show(report: "NightlyReport", registry: "Registry", config: "LeagueConfig", quiet: bool) -> None:
     """Print the results of a nightly run, and write the league's report."""
     from evaluation.reporting.gate_record import why_not_champion
-    from evaluation.reporting.html_page import write
-    from evaluation.reporting.league_report import league_report
 
     page = registry.storage.home / "reports" / f"{config.league}.html"
     with disk_errors(page):
         page.parent.mkdir(exist_ok=True)
-    write(league_report(registry, config.league), page)
+    write_report(registry, config.league, page)
     for fault in report.faults:
         complain(f"{config.league}: {fault}")
     if not quiet:

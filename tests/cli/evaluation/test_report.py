@@ -25,6 +25,7 @@ def test_the_report_can_be_a_json_document(league: League, registry: Registry, t
     league("evaluate", "tictactoe", "--blocks", "4", "--workers", "0")
     document = league("report", "tictactoe", "--json").json
     assert (document["league"], document["games"], len(document["versions"])) == ("tictactoe", 80, 3)
+    assert document["leaderboard"][0]["rank"] == 1
     assert {step["picture"] for game in document["upsets"] for step in game["steps"]} <= {None}
 
 

@@ -1,7 +1,9 @@
-"""A browser tab and the server that it opens."""
+"""A browser tab, the server that it opens, and the accessibility of its page."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page
 
 from league.registry.registry import Registry
@@ -36,3 +38,16 @@ class Tab:
     def ignore(self, status: int) -> None:
         """Ignore failed requests with a status that the test expects."""
         self.errors = [error for error in self.errors if not error.startswith(f"{FAILED_REQUEST}{status}")]
+
+
+def serious(page: Page) -> list[dict[str, Any]]:
+    """The serious and critical violations of a page that axe finds."""
+    violations = Axe().run(page).response["violations"]
+    return [
+        {
+            "rule": violation["id"],
+            "at": [node["html"][:200] + str(node.get("failureSummary"))[:300] for node in violation["nodes"]],
+        }
+        for violation in violations
+        if violation["impact"] in ("serious", "critical")
+    ]

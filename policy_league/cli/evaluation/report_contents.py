@@ -1,0 +1,200 @@
+"""What a report of a league contains: the documents of its HTTP API, from the same code that responds on a server."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import httpx
+
+from evaluation.matches.leaderboard import MOST_CONTESTANTS
+from evaluation.results import iso_timestamp
+from evaluation.service.game_worker import GameWorker
+from evaluation.service.snapshots import refresh
+from league.errors import AlreadyRunning
+from league.refs import CHAMPION
+from league.registry.registry import Registry
+from league.service_requests import GameRequest, GameResponse
+from serve_app.app import Replica
+from serve_app.settings import ServeSettings
+
+MAX_PAGE = 200
+"""Rows of a page, as many as the API returns."""
+MOST_VERDICTS = 200
+"""Verdicts with their evidence, the newest ones."""
+MOST_BYTES = 3_000_000
+"""Total size of all recorded games."""
+PATIENCE = 3600.0
+"""Timeout of a request, in seconds: an environment may need minutes to render a game."""
+RETRY = 0.2
+"""Seconds between two attempts while another process computes the results."""
+
+
+def league_report(registry: Registry, league: str) -> dict[str, Any]:
+    """Return the report of a league, `{"league", "made_at", "documents"}`.
+
+    Documents are by their paths in the API, with the parameter `side` only: lists are whole. They are empty where a
+    server has replicas, traffic, or results of earlier games.
+
+    Raises UnknownLeague or StorageError.
+    """
+    while True:
+        try:
+            refresh(registry, league)
+            break
+        except AlreadyRunning:
+            time.sleep(RETRY)
+    replica = Replica(
+        registry,
+        ServeSettings(require_keys="never", timeout=PATIENCE),
+        "report",
+        evaluation_client=_RecordedGames(GameWorker(league, registry)),
+    )
+    try:
+        made_at = iso_timestamp(datetime.now(UTC))
+        documents = asyncio.run(_documents(replica, f"/v1/leagues/{league}"))
+    finally:
+        replica.models.close()
+        replica.connection.close()
+    return {"league": league, "made_at": made_at, "documents": documents}
+
+
+class _RecordedGames:
+    """Replays recorded games in this process instead of an evaluation service."""
+
+    def __init__(self, worker: GameWorker) -> None:
+        self._worker = worker
+
+    def notify(self) -> None:
+        """Do nothing."""
+
+    async def request_game(self, request: GameRequest) -> GameResponse:
+        """Replay a game. Raises LeagueError."""
+        return self._worker.respond(request.operation)
+
+
+async def _documents(replica: Replica, base: str) -> dict[str, Any]:
+    transport = httpx.ASGITransport(replica.application())
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
+
+        async def get(path: str, **parameters: Any) -> Any:
+            return (await client.get(base + path, params=parameters)).raise_for_status().json()
+
+        async def whole(path: str, rows: str, **parameters: Any) -> Any:
+            document = page = await get(path, limit=MAX_PAGE, **parameters)
+            while page.get("next") is not None or len(document[rows]) < page.get("total", 0):
+                cursor = {"before": page["next"]} if "next" in page else {"offset": len(document[rows])}
+                page = await get(path, limit=MAX_PAGE, **parameters, **cursor)
+                document[rows] += page[rows]
+            return document | ({"next": None} if "next" in document else {})
+
+        about = await get("")
+        traffic = about["traffic"] | {"canary": None, "shadow": None}
+        about |= {"replicas": [], "faults": [], "traffic": traffic, "summary": about["summary"] | {"earlier": []}}
+        leaderboard = await whole("/leaderboard", "leaderboard")
+        verdicts = await whole("/verdicts", "verdicts")
+        documents = {
+            "": about,
+            "/leaderboard": leaderboard,
+            "/payoff": await get("/payoff"),
+            "/ratings": await get("/ratings"),
+            "/versions": await whole("/versions", "versions"),
+            "/verdicts": verdicts,
+        }
+        for side in leaderboard["sides"]:
+            documents[f"/leaderboard?side={side}"] = await whole("/leaderboard", "leaderboard", side=side)
+        for alias in sorted({CHAMPION, *about["aliases"]}):
+            path = f"/aliases/{alias}/history"
+            documents[path] = await whole(path, "history")
+        for verdict in verdicts["verdicts"][:MOST_VERDICTS]:
+            path = f"/verdicts/{verdict['verdict']}"
+            documents[path] = await get(path)
+        upsets = about["summary"]["upsets"]
+        for upset in upsets:
+            path = _game(upset)
+            documents[path] = await _recording(client, base + path, MOST_BYTES // len(upsets))
+    return {base + path: document for path, document in documents.items()}
+
+
+async def _recording(client: httpx.AsyncClient, path: str, room: int) -> Any:
+    """A game with its first and its last step: every step, or every second, fourth, … if all are more than `room` bytes
+    or than one response contains. Or the error of the replay.
+    """
+    every = 1
+    while True:
+        response = await client.get(path, params={"every": every})
+        recording = response.json()
+        steps = recording.get("steps")
+        is_complete = steps and steps[-1]["step"] == recording["length"]
+        if not steps or every > recording["length"] or (is_complete and len(response.content) <= room):
+            return recording
+        every *= 2
+
+
+def plain_document(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the contents of a report under names of their own, without images, for programs."""
+    league = report["league"]
+    documents = {path.removeprefix(f"/v1/leagues/{league}"): document for path, document in report["documents"].items()}
+    about, leaderboard = documents[""], documents["/leaderboard"]
+    champion, summary = about["champion"], about["summary"]
+    payoff = documents["/payoff"]["payoff"] or {"shares": []}
+    verdicts = (f"/verdicts/{row['verdict']}" for row in documents["/verdicts"]["verdicts"])
+    return summary | {
+        "league": league,
+        "made_at": report["made_at"],
+        "champion": champion and f"{league}@{champion}",
+        "leaderboard": leaderboard["leaderboard"],
+        "not_champion": leaderboard["not_champion"],
+        "by_side": {side: documents[f"/leaderboard?side={side}"]["leaderboard"] for side in leaderboard["sides"]},
+        "payoff": {name: table for name, table in payoff.items() if name != "shares"} or None,
+        "shares": payoff["shares"],
+        "versions": documents["/ratings"]["versions"],
+        "roles": {
+            f"{league}@{version['version']}": _role(version)
+            for version in documents["/versions"]["versions"]
+            if version["role"] != "main"
+        },
+        "verdicts": [documents[path] for path in verdicts if path in documents],
+        "promotions": [_promotion(event) for event in documents[f"/aliases/{CHAMPION}/history"]["history"]],
+        "upsets": [upset | _without_images(documents[_game(upset)]) for upset in summary["upsets"]],
+        "left_out": list(_omissions(documents)),
+    }
+
+
+def _omissions(documents: Mapping[str, Any]) -> Iterator[str]:
+    contestants, verdicts = documents["/leaderboard"]["total"], len(documents["/verdicts"]["verdicts"])
+    if contestants > MOST_CONTESTANTS:
+        yield f"The payoff matrix contains the best {MOST_CONTESTANTS} of {contestants} contestants."
+    if verdicts > MOST_VERDICTS:
+        yield f"Only the newest {MOST_VERDICTS} of {verdicts} verdicts have their evidence."
+
+
+def _game(upset: Mapping[str, Any]) -> str:
+    return f"/matches/{upset['match']}/games/{upset['game']}"
+
+
+def _role(version: Mapping[str, Any]) -> str:
+    if version["role"] == "exploiter":
+        return f"exploiter of {version['exploits']}"
+    shares = (f"@{member['version']} {100 * member['probability']:.1f} %" for member in version["members"])
+    return f"mixture of {', '.join(shares)}"
+
+
+def _promotion(event: Mapping[str, Any]) -> dict[str, Any]:
+    league, previous = event["league"], event["previous"]
+    by_hand = "by hand" if event["verdict"] is None else "promotion"
+    return {name: event[name] for name in ("at", "actor", "reason", "verdict")} | {
+        "kind": "rollback" if event["kind"] == "rollback" else by_hand,
+        "champion": f"{league}@{event['version']}",
+        "before": previous and f"{league}@{previous}",
+    }
+
+
+def _without_images(recording: dict[str, Any]) -> dict[str, Any]:
+    """A recorded game without its images; with the `fault`, if the server would have responded with an error."""
+    if "code" in recording:
+        return {"fault": recording["message"]}
+    return recording | {"steps": [step | {"picture": None} for step in recording["steps"]]}
