@@ -12,6 +12,8 @@ PRODUCT = ("league", "training", "serve_app", "evaluation", "policy_league")
 GENERATED = ("migrations/", "_pb2.py", "_sync/")
 MAX_LINES, MAX_DEPENDENCIES = 3_000, 14
 """Budget of a package, without its sub-packages: lines, and other packages of the product that it imports."""
+ONE_PER_RESOURCE = {"serve_app/routes": 4_000}
+"""Lines of packages with a module per resource of the HTTP API, which describes it, too."""
 
 
 def modules(*packages: str) -> list[Path]:
@@ -35,7 +37,8 @@ def test_a_package_is_small_and_uses_few_others() -> None:
             if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in PRODUCT:
                 module = Path(*node.module.split("."))
                 dependencies[package].add((module if (ROOT / module).is_dir() else module.parent).as_posix())
-    assert {package: count for package, count in lines.items() if count > MAX_LINES} == {}
+    large = {package: n for package, n in lines.items() if n > ONE_PER_RESOURCE.get(package, MAX_LINES)}
+    assert large == {}
     used = {package: sorted(others - {package}) for package, others in dependencies.items()}
     assert {package: others for package, others in used.items() if len(others) > MAX_DEPENDENCIES} == {}
 
