@@ -9,6 +9,7 @@ is left out if it is not installed.
 
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,7 +32,8 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.policies import load
 from league.policies.onnx import OnnxPolicy
-from league.policies.remote import RemotePolicy
+from league.policies.open_inference import OpenInferencePolicy
+from league.refs import RemoteRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
@@ -104,8 +106,8 @@ def _compare(model: ForeignModel, version: VersionRow, registry: Registry, url: 
         name: np.concatenate([batch.observations[name] for batch in played])[:observations]
         for name in played[0].observations
     }
-    space = row.interface.of_policy(policy).observation
-    with RemotePolicy(url, version.league, version.number, timeout=60, observation=space) as endpoint:
+    ref = RemoteRef(url, version.league, str(version.number))
+    with closing(OpenInferencePolicy(ref, policy, row.interface.of_policy(policy))) as endpoint:
         answers = [_answer(part, model, graph, endpoint) for part in _parts(together)]
     expected, by_graph, by_endpoint = map(np.concatenate, zip(*answers, strict=True))
     return Compared(
@@ -119,7 +121,7 @@ def _compare(model: ForeignModel, version: VersionRow, registry: Registry, url: 
 
 
 def _answer(
-    observations: Mapping[str, NDArray], model: ForeignModel, graph: OnnxPolicy, endpoint: RemotePolicy
+    observations: Mapping[str, NDArray], model: ForeignModel, graph: OnnxPolicy, endpoint: OpenInferencePolicy
 ) -> tuple[NDArray, NDArray, NDArray]:
     return model.act(observations), graph.act(observations).actions, endpoint.act(observations).actions
 

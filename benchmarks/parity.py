@@ -9,6 +9,7 @@ summation. Target: all others are equal.
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +24,9 @@ from league.interface import Interface
 from league.policies import load
 from league.policies.actions import to_environment
 from league.policies.onnx import STATE_IN
+from league.policies.open_inference import OpenInferencePolicy
 from league.policies.policy import Policy
-from league.policies.remote import RemotePolicy
+from league.refs import RemoteRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.manifest import TRAINING
@@ -99,9 +101,9 @@ def compare(version: VersionRow, registry: Registry, url: str, observations: int
     for policy, module in modules.items():
         graph = load(version.ref, policy, registry)
         model = f"{version.league}.{policy}" if several else version.league
-        with RemotePolicy(url, model, timeout=60) as endpoint:
-            space = row.interface.of_policy(policy).action
-            compared.append(_compare(policy, space, module, graph, endpoint, met[policy]))
+        spaces = row.interface.of_policy(policy)
+        with closing(OpenInferencePolicy(RemoteRef(url, model), policy, spaces)) as endpoint:
+            compared.append(_compare(policy, spaces.action, module, graph, endpoint, met[policy]))
     return compared
 
 

@@ -84,9 +84,9 @@ def _evaluate(config: "LeagueConfig") -> None:
 def _play(config: "LeagueConfig", url: str) -> None:
     from evaluation.playback.single_game import play_game
     from league.environments.lockstep import stock_stepping
-    from league.policies.remote import RemotePolicy
+    from league.policies.open_inference import remote_policies
     from league.policies.scripted import script
-    from league.refs import ScriptRef
+    from league.refs import RemoteRef, ScriptRef
 
     _step(4, f"Play a game over HTTP: the champion ● moves first against {OPPONENT} ○.")
     interface = open_registry().leagues.get(config.league).interface
@@ -94,7 +94,8 @@ def _play(config: "LeagueConfig", url: str) -> None:
     spaces = interface.agents[second]
     opponent = script(ScriptRef.parse(OPPONENT).name, spaces.observation, spaces.action)
     environment = stock_stepping(config.environment, num_envs=1)
-    with closing(environment), RemotePolicy(url, config.league) as champion:
+    (champion,) = remote_policies(RemoteRef(url, config.league), interface).values()
+    with closing(environment), closing(champion):
         steps = list(play_game(environment, {first: champion, second: opponent}, seed=config.training.seed))
     moves = [move for step in steps for move in step.moves]
     board = next(drawing(e.observation["observation"]) for e in steps[-1].endings if e.agent == 0)

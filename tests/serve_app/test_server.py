@@ -5,7 +5,7 @@ import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,9 @@ from evaluation.matches.tournament import evaluate
 from evaluation.results import EvaluationReport
 from league.client import Client, Stream
 from league.client.stream_protocol import StreamProtocol
-from league.errors import UnknownLeague
 from league.policies.onnx import OnnxPolicy
-from league.policies.remote import RemotePolicy
+from league.policies.open_inference import OpenInferencePolicy
+from league.refs import RemoteRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from league.results.ledger import Ledger
@@ -42,7 +42,6 @@ from tests.support.servers.under_load import ACTION, RayServer, load, processes,
 from tests.support.waiting import until
 
 EVALUATIONS = "/v1/leagues/tictactoe/evaluations"
-BATCH = {"observation": np.zeros((1, 6, 7, 2), np.int8), "action_mask": np.ones((1, 7), np.int8)}
 
 
 @pytest.fixture(scope="module")
@@ -185,22 +184,15 @@ def test_mixtures_are_swapped_under_load_and_pinned_in_every_replica(url: str, s
     assert seen.versions.keys() <= {1, 2, 3}
 
 
-def test_the_client_gets_the_actions_of_the_graph(url: str) -> None:
+def test_a_remote_policy_acts_as_the_graph(url: str, served: Registry) -> None:
     random = np.random.default_rng(0)
     mask = random.integers(0, 2, (50, 7), dtype=np.int8)
     mask[:, 0] = 1
     batch = {"observation": random.integers(0, 2, (50, 6, 7, 2), dtype=np.int8), "action_mask": mask}
     expected = OnnxPolicy(masked_mlp(seed=1)).act(batch).actions
-    with RemotePolicy(url, "board", version=2) as policy:
+    spaces = served.leagues.get("board").interface.of_policy("shared")
+    with closing(OpenInferencePolicy(RemoteRef(url, "board", "2"), "shared", spaces)) as policy:
         np.testing.assert_array_equal(policy.act(batch).actions, expected)
-        explored = [
-            policy.act(batch, explore=True, rng=[np.random.default_rng((7, row)) for row in range(50)]).actions
-            for _ in range(2)
-        ]
-        np.testing.assert_array_equal(*explored)
-        assert mask[np.arange(50), explored[0]].all()
-    with RemotePolicy(url, "nobody") as policy, pytest.raises(UnknownLeague, match="known: board"):
-        policy.act(BATCH)
 
 
 def test_promotions_under_load_lose_no_request(url: str, served: Registry) -> None:
