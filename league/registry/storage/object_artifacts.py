@@ -132,26 +132,31 @@ class ObjectArtifactStore(ArtifactStore):
 
     def _get(self, key: str) -> bytes | None:
         with self._errors():
-            try:
-                return bytes(self._store.get(key).bytes())
-            except FileNotFoundError as error:
-                if _is_missing_bucket(error):
-                    raise
-                return None
+            response = self._find(key)
+            return None if response is None else bytes(response.bytes())
+
+    def _find(self, key: str) -> Any:
+        """The response with an object; None if there is none in the bucket."""
+        try:
+            return self._store.get(key)
+        except FileNotFoundError as error:
+            if _is_missing_bucket(error):
+                raise
+            return None
 
     def _download(self, manifest: Manifest, name: str, target: Path) -> None:
         """Stream a file to `target`."""
-        file_label, digest = label(manifest.league, manifest.version, name), None
-        with disk_errors(target), self._errors(), _missing_is_none():
-            response = self._store.get(f"{self._key(manifest.league, manifest.version)}/{name}")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            hashed = hashlib.sha256()
-            with target.open("wb") as file:
-                for chunk in response.stream():
-                    hashed.update(chunk)
-                    file.write(chunk)
-            digest = hashed.hexdigest()
-        check_digest(file_label, manifest.files[name], digest)
+        hashed = hashlib.sha256()
+        with disk_errors(target), self._errors():
+            response = self._find(f"{self._key(manifest.league, manifest.version)}/{name}")
+            if response is not None:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with target.open("wb") as file:
+                    for chunk in response.stream():
+                        hashed.update(chunk)
+                        file.write(chunk)
+        digest = None if response is None else hashed.hexdigest()
+        check_digest(label(manifest.league, manifest.version, name), manifest.files[name], digest)
 
     def _objects(self, prefix: str) -> list[tuple[str, int]]:
         """Return key and size of the objects whose key starts with `prefix`."""
@@ -211,16 +216,6 @@ def _connect(url: str) -> Any:
         )
     except (BaseError, ValueError) as error:
         raise ConfigError(f"LEAGUE_ARTIFACTS={url} is invalid: {_cause(error)}") from error
-
-
-@contextmanager
-def _missing_is_none() -> Iterator[None]:
-    """End the block without an error if an object does not exist in an existing bucket."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        if _is_missing_bucket(error):
-            raise
 
 
 def _is_missing_bucket(error: Exception) -> bool:
