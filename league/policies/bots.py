@@ -77,7 +77,9 @@ class Bot:
         for row in range(rows):
             row_observations = {name: array[row] for name, array in observations.items()}
             try:
-                act = self._bot if after is None else self._instance(after[INSTANCE], row).act
+                if after is not None and isinstance(after[INSTANCE][row], int):
+                    after[INSTANCE][row] = self._bot()  # at the first action in an episode
+                act = self._bot if after is None else after[INSTANCE][row].act
                 action = act(
                     self._observation(row_observations),
                     **self._optional(row_observations, None if rng is None else rng[row]),
@@ -88,12 +90,6 @@ class Bot:
             except Exception as error:
                 faults[row] = error
         return Actions(actions, after, faults=faults)
-
-    def _instance(self, instances: NDArray, row: int) -> Any:
-        """The instance of a row, which is created at the first action in an episode."""
-        if isinstance(instances[row], int):
-            instances[row] = self._bot()
-        return instances[row]
 
     def _optional(self, observations: Mapping[str, Any], rng: Any) -> dict[str, Any]:
         arguments = {ACTION_MASK: observations.get(ACTION_MASK), "rng": rng}

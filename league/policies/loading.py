@@ -114,17 +114,15 @@ def contestant(ref: str, registry: Registry | None, interface: Interface) -> dic
     policies: Mapping[str, Policy]
     match parse_ref(ref):
         case ScriptRef() as parsed:
-            policies = _script(parsed, interface)
+            spaces = {policy: interface.of_policy(policy) for policy in interface.policy_ids}
+            policies = {
+                policy: script(parsed.name, space.observation, space.action) for policy, space in spaces.items()
+            }
         case RemoteRef() as parsed:
             policies = remote_policies(parsed, interface)
         case CheckpointRef() as parsed:
             policies = _version(parsed, registry, interface)
     return {agent: (interface.policies[agent], policies[interface.policies[agent]]) for agent in interface.agents}
-
-
-def _script(ref: ScriptRef, interface: Interface) -> dict[str, Policy]:
-    spaces = {policy: interface.of_policy(policy) for policy in interface.policy_ids}
-    return {policy: script(ref.name, space.observation, space.action) for policy, space in spaces.items()}
 
 
 def _version(ref: CheckpointRef, registry: Registry | None, interface: Interface) -> dict[str, Policy]:
@@ -188,7 +186,8 @@ def requested(ref: str, league: str, registry: Registry) -> str:
     """
     config = registry.leagues.get(league).config
     if _is_remote(ref):
-        if RemoteRef.parse(ref).default not in (remotes := _configured_remotes(config)):
+        remotes = [RemoteRef.parse(named).default for named in configured_contestants(config) if _is_remote(named)]
+        if RemoteRef.parse(ref).default not in remotes:
             raise _not_configured(ref, config, "remote models", [str(remote) for remote in remotes])
         return ref
     fixed = pinned(ref, league, registry)
@@ -224,7 +223,12 @@ def check_anchors(config: LeagueConfig, registry: Registry) -> None:
     Raises:
         ConfigError: One does not exist, or cannot play in this league.
     """
-    for error in _errors_of_contestants(config, partial(_check_anchor, config=config, registry=registry)):
+
+    def check(key: str, ref: CheckpointRef | ScriptRef | RemoteRef) -> None:
+        if key == ANCHORS and isinstance(ref, CheckpointRef):
+            _check_version(ref, config, registry)
+
+    for error in _errors_of_contestants(config, check):
         raise error
 
 
@@ -247,13 +251,6 @@ def errors_of_contestants(
 def _check_script(_: str, ref: CheckpointRef | ScriptRef | RemoteRef, interface: Interface) -> None:
     if not isinstance(ref, CheckpointRef):
         check_plays(ref, interface)
-
-
-def _check_anchor(
-    key: str, ref: CheckpointRef | ScriptRef | RemoteRef, config: LeagueConfig, registry: Registry
-) -> None:
-    if key == ANCHORS and isinstance(ref, CheckpointRef):
-        _check_version(ref, config, registry)
 
 
 def _check_version(ref: CheckpointRef, config: LeagueConfig, registry: Registry) -> None:
@@ -323,10 +320,6 @@ def _plays(ref: str, interface: Interface) -> bool:
     except (ConfigError, EnvironmentMismatch, UnknownPolicy):
         return False
     return True
-
-
-def _configured_remotes(config: LeagueConfig) -> list[RemoteRef]:
-    return [RemoteRef.parse(ref).default for ref in configured_contestants(config) if _is_remote(ref)]
 
 
 def _is_remote(ref: str) -> bool:

@@ -90,7 +90,8 @@ class BatchedMinimax:
                 line = ~np.zeros_like(pieces)
                 for distance in range(self._game.length):
                     if distance != gap:
-                        line &= _shift(pieces, (gap - distance) * step)
+                        bits = (gap - distance) * step
+                        line &= pieces << np.uint64(bits) if bits >= 0 else pieces >> np.uint64(-bits)
                 squares |= line
         return squares
 
@@ -105,8 +106,3 @@ class Minimax(BestMoves):
     def best(self, boards: NDArray, legal: NDArray) -> NDArray:
         values = np.where(legal, self._search.values(*self._search.positions(boards), self._plies), LOST)
         return legal & (values == values.max(axis=1, keepdims=True))
-
-
-def _shift(pieces: Bitboards, distance: int) -> Bitboards:
-    """Move pieces up by a number of bits, down by a negative one."""
-    return pieces << np.uint64(distance) if distance >= 0 else pieces >> np.uint64(-distance)
