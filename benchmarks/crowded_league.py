@@ -17,7 +17,7 @@ from sqlalchemy import Executable, delete, update
 from benchmarks.harness import Quick, Target
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY
-from league.registry.storage import tables
+from league.registry.storage import rows
 from league.results.ledger import Ledger
 from league.subprocesses import Subprocess
 from tests.support.leagues.crowded_league import LEAGUE, crowd
@@ -43,10 +43,8 @@ def _snapshots(registry: Registry) -> Iterator[Target]:
     storage = registry.storage
     os.environ |= {"LEAGUE_HOME": str(storage.home), "LEAGUE_DATABASE_URL": storage.database_url}
     stale: dict[str, Executable] = {
-        "after one match more": update(tables.SnapshotTable)
-        .where(tables.SnapshotTable.part == SUMMARY)
-        .values(mark=""),
-        "from nothing": delete(tables.SnapshotTable),
+        "after one match more": update(rows.SnapshotRow).where(rows.SnapshotRow.part == SUMMARY).values(mark=""),
+        "from nothing": delete(rows.SnapshotRow),
     }
     for name, change in stale.items():
         with registry.database.write() as session:

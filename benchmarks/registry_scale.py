@@ -29,8 +29,8 @@ from benchmarks.registry import server_load
 from league.errors import NotReady
 from league.registry.registry import Registry
 from league.registry.storage.database import clock
-from league.registry.storage.rows import ReadPosition, ServedState
-from league.registry.storage.tables import AliasEventTable, AliasTable, LeagueTable, ReplicaTable, VersionTable
+from league.registry.storage.rows import AliasEvent, LeagueRow, ReadPosition, ServedState
+from league.registry.storage.tables import AliasTable, ReplicaTable, VersionTable
 from league.settings import Storage
 from tests.support.servers import postgresql
 from tests.support.servers.postgresql_replicas import standalone_replica
@@ -200,14 +200,14 @@ def _copies_of_the_league(registry: Registry, number: int) -> list[str]:
     """Insert leagues with the rows of LEAGUE; returns their names."""
     names = [f"league-{i:04}" for i in range(number)]
     with registry.database.write() as session:
-        for table in (LeagueTable, VersionTable):
-            name = "slug" if table is LeagueTable else "league"
+        for table in (LeagueRow, VersionTable):
+            name = "slug" if table is LeagueRow else "league"
             rows = session.execute(select(table.__table__).filter_by(**{name: LEAGUE})).mappings()
             session.execute(insert(table), [dict(row) | {name: copy} for row in rows for copy in names])
         moment = clock(session)
         event = {"alias": "champion", "kind": "set", "version": 1, "actor": "benchmark", "reason": "many", "at": moment}
-        session.execute(insert(AliasEventTable), [event | {"league": name} for name in names])
-        events = session.execute(select(AliasEventTable.id, AliasEventTable.league))
+        session.execute(insert(AliasEvent), [event | {"league": name} for name in names])
+        events = session.execute(select(AliasEvent.id, AliasEvent.league))
         aliases = [{"league": name, "name": "champion", "version": 1, "event": id_} for id_, name in events]
         session.execute(insert(AliasTable), [row for row in aliases if row["league"] != LEAGUE])
     return names

@@ -73,8 +73,20 @@ def measure_strength(registry: Registry, worker: MatchWorker, number: int, games
         matches = _play(worker, version.ref, opponent, games // GAMES_PER_BLOCK)
         scores = [match.score(match.contestants.index(version.ref)) for match in matches]
         mean, low, high = score_interval(scores)
-        played = GAMES_PER_BLOCK * len(matches)
-        rows.append(StrengthRow(number, version.steps, opponent, played, mean, low, high, datetime.now(UTC)))
+        rows.append(
+            StrengthRow(
+                league=version.league,
+                version=number,
+                opponent=opponent,
+                run=version.run,
+                steps=version.steps,
+                games=GAMES_PER_BLOCK * len(matches),
+                score=mean,
+                low=low,
+                high=high,
+                at=datetime.now(UTC),
+            )
+        )
     return rows
 
 

@@ -12,6 +12,8 @@ Events form a stack for rollback:
 
 from datetime import UTC, datetime
 from enum import Enum
+from functools import partial
+from typing import Literal
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -22,8 +24,8 @@ from league.registry import leagues, verdicts, versions
 from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, repeat_after_deadlock
 from league.registry.storage.idempotency import IdempotentCall, apply_once
-from league.registry.storage.rows import AliasEvent, AliasTarget, detached
-from league.registry.storage.tables import AliasEventTable, AliasTable
+from league.registry.storage.rows import AliasEvent, AliasTarget
+from league.registry.storage.tables import AliasTable
 
 
 class AnyVersion(Enum):
@@ -74,9 +76,17 @@ class AliasRepository(Repository):
             leagues.lock(session, league)
 
             def change() -> AliasEvent:
-                return _set(session, league, alias, version, expected, actor=actor, reason=reason, verdict=verdict)
+                if verdict is not None:
+                    verdicts.require_open(session, verdict)
+                last = _check(session, league, alias, version, expected)
+                if last and last.version == version:
+                    return last
+                beneath = last.id if last else None
+                return _record(
+                    session, league, alias, last, "set", version, beneath, actor=actor, reason=reason, verdict=verdict
+                )
 
-            return apply_once(session, call, "event", change=change, load=lambda event: _load(session, event))
+            return apply_once(session, call, "event", change=change, load=partial(session.get_one, AliasEvent))
 
     def check(self, league: str, alias: str, version: int, *, expected: int | AnyVersion | None) -> None:
         """Raise what `set` would raise now, and change nothing: for callers that ask for confirmation first."""
@@ -102,9 +112,22 @@ class AliasRepository(Repository):
             leagues.lock(session, league)
 
             def change() -> AliasEvent:
-                return _roll_back(session, league, CHAMPION, expected, actor=actor, reason=reason)
+                last = _in_force(session, league, CHAMPION)
+                _require(last, league, CHAMPION, expected)
+                beneath = session.get(AliasEvent, last.beneath) if last and last.beneath else None
+                if beneath is None:
+                    reason_against = (
+                        f"has no version before {league}@{last.version} to return to"
+                        if last
+                        else "is not set: promote a version"
+                    )
+                    raise NothingToRollBack(f"alias {CHAMPION} of league {league} {reason_against}")
+                version, next_beneath = beneath.version, beneath.beneath
+                return _record(
+                    session, league, CHAMPION, last, "rollback", version, next_beneath, actor=actor, reason=reason
+                )
 
-            return apply_once(session, call, "event", change=change, load=lambda event: _load(session, event))
+            return apply_once(session, call, "event", change=change, load=partial(session.get_one, AliasEvent))
 
     def history(
         self,
@@ -119,7 +142,7 @@ class AliasRepository(Repository):
 
         at: return only the event in force at this time. before: return only events older than the event with this id.
         """
-        table = AliasEventTable
+        table = AliasEvent
         query = select(table).filter_by(league=league, alias=alias).order_by(table.id.desc()).limit(limit)
         if before is not None:
             query = query.where(table.id < before)
@@ -127,7 +150,7 @@ class AliasRepository(Repository):
             query = query.where(table.at <= at).limit(1)
         with self._database.read() as session:
             leagues.require(session, league)
-            return [_row(event) for event in session.scalars(query)]
+            return list(session.scalars(query))
 
 
 def current(session: Session, league: str) -> dict[str, int]:
@@ -137,36 +160,9 @@ def current(session: Session, league: str) -> dict[str, int]:
     return {alias.name: alias.version for alias in aliases}
 
 
-def _set(
-    session: Session,
-    league: str,
-    alias: str,
-    version: int,
-    expected: int | AnyVersion | None,
-    *,
-    actor: str,
-    reason: str,
-    verdict: str | None,
-) -> AliasEvent:
-    if verdict is not None:
-        verdicts.require_open(session, verdict)
-    last = _check(session, league, alias, version, expected)
-    if last and last.version == version:
-        return _row(last)
-    event = AliasEventTable(
-        kind="set",
-        version=version,
-        beneath=last.id if last else None,
-        actor=actor,
-        reason=reason,
-        verdict=verdict,
-    )
-    return _record(session, league, alias, last, event)
-
-
 def _check(
     session: Session, league: str, alias: str, version: int, expected: int | AnyVersion | None
-) -> AliasEventTable | None:
+) -> AliasEvent | None:
     """Return the event in force if the alias may be moved from `expected` to `version`, else raise."""
     require = versions.require_promotable if alias == CHAMPION else versions.require_files
     require(session, league, version)
@@ -175,35 +171,12 @@ def _check(
     return last
 
 
-def _roll_back(
-    session: Session, league: str, alias: str, expected: int | AnyVersion, *, actor: str, reason: str
-) -> AliasEvent:
-    last = _in_force(session, league, alias)
-    _require(last, league, alias, expected)
-    beneath = session.get(AliasEventTable, last.beneath) if last and last.beneath else None
-    if beneath is None:
-        if last is None:
-            was = "is not set: promote a version"
-        else:
-            was = f"has no version before {league}@{last.version} to return to"
-        raise NothingToRollBack(f"alias {alias} of league {league} {was}")
-    event = AliasEventTable(
-        kind="rollback",
-        version=beneath.version,
-        beneath=beneath.beneath,
-        actor=actor,
-        reason=reason,
-        verdict=None,
-    )
-    return _record(session, league, alias, last, event)
-
-
-def _in_force(session: Session, league: str, alias: str) -> AliasEventTable | None:
-    query = select(AliasEventTable).join(AliasTable, AliasTable.event == AliasEventTable.id)
+def _in_force(session: Session, league: str, alias: str) -> AliasEvent | None:
+    query = select(AliasEvent).join(AliasTable, AliasTable.event == AliasEvent.id)
     return session.scalar(query.where(AliasTable.league == league, AliasTable.name == alias))
 
 
-def _require(last: AliasEventTable | None, league: str, alias: str, expected: int | AnyVersion | None) -> None:
+def _require(last: AliasEvent | None, league: str, alias: str, expected: int | AnyVersion | None) -> None:
     """Raise AliasMoved unless the alias points to `expected`."""
     version = last.version if last else None
     if expected is not ANY and version != expected:
@@ -215,22 +188,33 @@ def _require(last: AliasEventTable | None, league: str, alias: str, expected: in
 
 
 def _record(
-    session: Session, league: str, alias: str, last: AliasEventTable | None, event: AliasEventTable
+    session: Session,
+    league: str,
+    alias: str,
+    last: AliasEvent | None,
+    kind: Literal["set", "rollback"],
+    version: int,
+    beneath: int | None,
+    *,
+    actor: str,
+    reason: str,
+    verdict: str | None = None,
 ) -> AliasEvent:
     change_counter.count(session, "aliases")
-    event.league, event.alias = league, alias
-    event.previous = last.version if last else None
-    # Clocks of machines differ. Events are ordered by id, and their times must not contradict that order.
-    event.at = max(datetime.now(UTC), last.at) if last else datetime.now(UTC)
+    event = AliasEvent(
+        league=league,
+        alias=alias,
+        kind=kind,
+        version=version,
+        previous=last.version if last else None,
+        beneath=beneath,
+        actor=actor,
+        reason=reason,
+        verdict=verdict,
+        # Clocks of machines differ. Events are ordered by id, and their times must not contradict that order.
+        at=max(datetime.now(UTC), last.at) if last else datetime.now(UTC),
+    )
     session.add(event)
     session.flush()
-    session.merge(AliasTable(league=league, name=alias, version=event.version, event=event.id))
-    return _row(event)
-
-
-def _load(session: Session, event: int) -> AliasEvent:
-    return _row(session.get_one(AliasEventTable, event))
-
-
-def _row(event: AliasEventTable) -> AliasEvent:
-    return detached(AliasEvent, event)
+    session.merge(AliasTable(league=league, name=alias, version=version, event=event.id))
+    return event

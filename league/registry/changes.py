@@ -11,17 +11,23 @@ from league.registry import aliases, evaluations, replicas
 from league.registry.replicas import LIVENESS_TIMEOUT, ReplicaRepository
 from league.registry.storage import change_counter
 from league.registry.storage.database import Database, Repository
-from league.registry.storage.rows import Acknowledgement, AliasEvent, ChangeCounts, ChangeToken, Traffic
+from league.registry.storage.rows import (
+    Acknowledgement,
+    AliasEvent,
+    ChangeCounts,
+    ChangeToken,
+    EvaluationRow,
+    RunRow,
+    SnapshotRow,
+    Traffic,
+    VerdictRow,
+)
 from league.registry.storage.tables import (
     READY,
     AcknowledgementTable,
     AliasTable,
-    EvaluationTable,
     ReplicaTable,
-    RunTable,
-    SnapshotTable,
     TrafficEventTable,
-    VerdictTable,
     VersionNoteTable,
     VersionTable,
 )
@@ -53,8 +59,8 @@ class ChangeRepository(Repository):
         Cheap enough for polling: each query reads the end of an index, or a few rows.
         since: how old the last report of a live replica may be.
         """
-        outcomes = select(VerdictTable.outcome, func.count()).filter_by(league=league).group_by(VerdictTable.outcome)
-        newest_run = select(RunTable.id).filter_by(league=league).order_by(RunTable.began_at.desc(), RunTable.id.desc())
+        outcomes = select(VerdictRow.outcome, func.count()).filter_by(league=league).group_by(VerdictRow.outcome)
+        newest_run = select(RunRow.id).filter_by(league=league).order_by(RunRow.began_at.desc(), RunRow.id.desc())
         with self._database.read() as session:
             return ChangeToken(
                 league=league,
@@ -65,11 +71,11 @@ class ChangeRepository(Repository):
                 traffic=session.scalar(select(func.max(TrafficEventTable.id)).filter_by(league=league)),
                 serving=replicas.serving(session, league, since),
                 verdicts={outcome or OPEN: count for outcome, count in session.execute(outcomes)},
-                evaluation=session.scalar(select(func.max(EvaluationTable.id)).filter_by(league=league)),
+                evaluation=session.scalar(select(func.max(EvaluationRow.id)).filter_by(league=league)),
                 evaluations=evaluations.active(session, league),
                 run=session.scalar(newest_run.limit(1)),
                 runs=runs.active(session, league),
-                computed_at=session.scalar(select(func.max(SnapshotTable.at)).filter_by(league=league)),
+                computed_at=session.scalar(select(func.max(SnapshotRow.at)).filter_by(league=league)),
             )
 
     def wait_for_alias(
@@ -169,7 +175,12 @@ class ChangeRepository(Repository):
                     for one in self._replicas.acknowledgements(league)
                     if one.replica in late
                 ]
-                raise NotReady(f"{done}, but after {timeout:g} s {_why(registered, reasons)}")
+                problem = (
+                    f"{len(reasons)} of {registered} replicas have not confirmed it: {'; '.join(reasons)}"
+                    if registered
+                    else "no replica has reported: is a server running on this registry?"
+                )
+                raise NotReady(f"{done}, but after {timeout:g} s {problem}")
             if time.monotonic() >= next_search:
                 self._replicas.remove_ended()
                 next_search = time.monotonic() + ENDED_SECONDS
@@ -179,12 +190,6 @@ class ChangeRepository(Repository):
         query = select(ReplicaTable.replica).select_from(replicas.with_acknowledgement(league)).where(condition)
         with self._database.read() as session:
             return list(session.scalars(query.order_by(ReplicaTable.replica)))
-
-
-def _why(registered: int, reasons: list[str]) -> str:
-    if not registered:
-        return "no replica has reported: is a server running on this registry?"
-    return f"{len(reasons)} of {registered} replicas have not confirmed it: {'; '.join(reasons)}"
 
 
 def _silence(found: Acknowledgement) -> str:

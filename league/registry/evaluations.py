@@ -8,6 +8,7 @@ evaluation ends immediately, a running one as soon as its runner notices.
 """
 
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from typing import Any
 
 from sqlalchemy import ColumnElement, func, or_, select
@@ -17,10 +18,13 @@ from league.errors import TooManyEvaluations, UnknownEvaluation
 from league.registry import leagues
 from league.registry.storage.database import Repository
 from league.registry.storage.idempotency import IdempotentCall, apply_once
-from league.registry.storage.rows import EvaluationRow, EvaluationState, detached
-from league.registry.storage.tables import EvaluationTable
+from league.registry.storage.rows import EvaluationRow, EvaluationState
 
-QUEUED, RUNNING, DONE, FAILED, STOPPED = "queued", "running", "done", "failed", "stopped"
+QUEUED: EvaluationState = "queued"
+RUNNING: EvaluationState = "running"
+DONE: EvaluationState = "done"
+FAILED: EvaluationState = "failed"
+STOPPED: EvaluationState = "stopped"
 HEARTBEAT_TIMEOUT = timedelta(seconds=15)
 """A runner without a heartbeat for longer is considered dead."""
 MAX_ATTEMPTS = 5
@@ -54,43 +58,56 @@ class EvaluationRepository(Repository):
         """
         with self._database.write() as session:
             leagues.lock(session, league)
-            return apply_once(
-                session,
-                call,
-                "evaluation",
-                change=lambda: _submit(
-                    session,
-                    league,
-                    request,
+
+            def change() -> EvaluationRow:
+                active = select(func.count()).where(EvaluationRow.state.in_((QUEUED, RUNNING)))
+                for query, limit, where in (
+                    (active, max_active, ""),
+                    (
+                        active.where(EvaluationRow.league == league),
+                        max_active if max_of_league is None else max_of_league,
+                        f" of {league}",
+                    ),
+                ):
+                    if (waiting := session.scalar(query) or 0) >= limit:
+                        raise TooManyEvaluations(
+                            f"{waiting} evaluations{where} are queued or running, the limit is {limit}: try again later"
+                        )
+                evaluation = EvaluationRow(
+                    league=league,
+                    request=request,
+                    state=QUEUED,
                     actor=actor,
                     key=key,
                     reason=reason,
-                    max_active=max_active,
-                    max_of_league=max_active if max_of_league is None else max_of_league,
-                ),
-                load=lambda number: _row(session.get_one(EvaluationTable, number)),
-            )
+                    created_at=datetime.now(UTC),
+                )
+                session.add(evaluation)
+                session.flush()
+                return evaluation
+
+            return apply_once(session, call, "evaluation", change=change, load=partial(session.get_one, EvaluationRow))
 
     def get(self, league: str, number: int) -> EvaluationRow:
         """Return one evaluation. Raises UnknownLeague or UnknownEvaluation."""
         with self._database.read() as session:
-            return _row(_of_league(session, league, number))
+            return _of_league(session, league, number)
 
     def newest(self, league: str, *, before: int | None = None, limit: int = 20) -> list[EvaluationRow]:
         """Return at most `limit` evaluations of a league, newest first. Raises UnknownLeague.
 
         before: return only evaluations with a lower number.
         """
-        query = select(EvaluationTable).filter_by(league=league).order_by(EvaluationTable.id.desc()).limit(limit)
+        query = select(EvaluationRow).filter_by(league=league).order_by(EvaluationRow.id.desc()).limit(limit)
         if before is not None:
-            query = query.where(EvaluationTable.id < before)
+            query = query.where(EvaluationRow.id < before)
         with self._database.read() as session:
             leagues.require(session, league)
-            return [_row(evaluation) for evaluation in session.scalars(query)]
+            return list(session.scalars(query))
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Return league → state → number of queued and running evaluations, of the leagues that have any."""
-        table = EvaluationTable
+        table = EvaluationRow
         query = select(table.league, table.state, func.count()).where(table.state.in_((QUEUED, RUNNING)))
         counts: dict[str, dict[str, int]] = {}
         with self._database.read() as session:
@@ -106,15 +123,24 @@ class EvaluationRepository(Repository):
                 evaluation.stop_at, evaluation.stopped_by = datetime.now(UTC), actor
                 if evaluation.state == QUEUED:
                     _end(evaluation, STOPPED)
-            return _row(evaluation)
+            return evaluation
 
     def claim(self, runner: str, workers: int) -> EvaluationRow | None:
         """Assign the oldest evaluation that is queued, or whose runner is dead, to `runner`; None if there is none."""
         with self._database.read() as session:
-            if session.scalar(select(EvaluationTable.id).where(_is_free()).limit(1)) is None:
+            if session.scalar(select(EvaluationRow.id).where(_is_free()).limit(1)) is None:
                 return None
+        # One row at a time: locking all free rows would leave none for concurrent claims.
+        query = select(EvaluationRow).where(_is_free()).order_by(EvaluationRow.id).limit(1)
         with self._database.write() as session:
-            return _claim(session, runner, workers)
+            while (evaluation := session.scalar(query.with_for_update(skip_locked=True))) is not None:
+                if not _ends_here(evaluation):
+                    evaluation.state, evaluation.runner, evaluation.workers = RUNNING, runner, workers
+                    evaluation.attempts += 1
+                    evaluation.heartbeat_at = datetime.now(UTC)
+                    evaluation.started_at = evaluation.started_at or evaluation.heartbeat_at
+                    return evaluation
+        return None
 
     def heartbeat(self, number: int, runner: str, progress: dict[str, Any] | None = None) -> EvaluationRow:
         """Record a heartbeat of a runner and its progress.
@@ -122,12 +148,12 @@ class EvaluationRepository(Repository):
         Returns the evaluation, which shows whether it is still assigned to `runner`.
         """
         with self._database.write() as session:
-            evaluation = session.get_one(EvaluationTable, number, with_for_update=True)
+            evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
             if _is_held(evaluation, runner):
                 evaluation.heartbeat_at = datetime.now(UTC)
                 if progress is not None and progress != evaluation.progress:
                     evaluation.progress, evaluation.attempts = progress, 0
-            return _row(evaluation)
+            return evaluation
 
     def finish(
         self,
@@ -141,7 +167,7 @@ class EvaluationRepository(Repository):
     ) -> None:
         """Record how an evaluation ended, unless another runner has claimed it."""
         with self._database.write() as session:
-            evaluation = session.get_one(EvaluationTable, number, with_for_update=True)
+            evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
             if _is_held(evaluation, runner):
                 evaluation.progress, evaluation.result = progress or evaluation.progress, result
                 _end(evaluation, state, error)
@@ -149,70 +175,21 @@ class EvaluationRepository(Repository):
     def release(self, number: int, runner: str) -> None:
         """Queue an unfinished evaluation again because its runner is gone, unless it was to be stopped."""
         with self._database.write() as session:
-            evaluation = session.get_one(EvaluationTable, number, with_for_update=True)
+            evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
             if _is_held(evaluation, runner) and not _ends_here(evaluation):
                 evaluation.state = QUEUED
 
 
 def active(session: Session, league: str) -> tuple[EvaluationRow, ...]:
     """Return the queued and running evaluations of a league, oldest first."""
-    table = EvaluationTable
+    table = EvaluationRow
     query = select(table).where(table.state.in_((QUEUED, RUNNING)), table.league == league).order_by(table.id)
-    return tuple(_row(evaluation) for evaluation in session.scalars(query))
+    return tuple(session.scalars(query))
 
 
-def _submit(
-    session: Session,
-    league: str,
-    request: dict[str, Any],
-    *,
-    actor: str,
-    key: str | None,
-    reason: str | None,
-    max_active: int,
-    max_of_league: int,
-) -> EvaluationRow:
-    active = select(func.count()).where(EvaluationTable.state.in_((QUEUED, RUNNING)))
-    for query, limit, where in (
-        (active, max_active, ""),
-        (active.where(EvaluationTable.league == league), max_of_league, f" of {league}"),
-    ):
-        if (waiting := session.scalar(query) or 0) >= limit:
-            raise TooManyEvaluations(
-                f"{waiting} evaluations{where} are queued or running, the limit is {limit}: try again later"
-            )
-    evaluation = EvaluationTable(
-        league=league,
-        request=request,
-        state=QUEUED,
-        actor=actor,
-        key=key,
-        reason=reason,
-        attempts=0,
-        created_at=datetime.now(UTC),
-    )
-    session.add(evaluation)
-    session.flush()
-    return _row(evaluation)
-
-
-def _claim(session: Session, runner: str, workers: int) -> EvaluationRow | None:
-    claimed_at = datetime.now(UTC)
-    # One row at a time: locking all free rows would leave none for concurrent claims.
-    query = select(EvaluationTable).where(_is_free()).order_by(EvaluationTable.id).limit(1)
-    while (evaluation := session.scalar(query.with_for_update(skip_locked=True))) is not None:
-        if not _ends_here(evaluation):
-            evaluation.state, evaluation.runner, evaluation.workers = RUNNING, runner, workers
-            evaluation.attempts += 1
-            evaluation.started_at = evaluation.started_at or claimed_at
-            evaluation.heartbeat_at = claimed_at
-            return _row(evaluation)
-    return None
-
-
-def _of_league(session: Session, league: str, number: int, lock: bool = False) -> EvaluationTable:
+def _of_league(session: Session, league: str, number: int, lock: bool = False) -> EvaluationRow:
     leagues.require(session, league)
-    evaluation = session.get(EvaluationTable, number, with_for_update=lock or None)
+    evaluation = session.get(EvaluationRow, number, with_for_update=lock or None)
     if evaluation is None or evaluation.league != league:
         raise UnknownEvaluation(f"league {league} has no evaluation {number}")
     return evaluation
@@ -220,15 +197,15 @@ def _of_league(session: Session, league: str, number: int, lock: bool = False) -
 
 def _is_free() -> ColumnElement[bool]:
     oldest = datetime.now(UTC) - HEARTBEAT_TIMEOUT
-    is_orphaned = (EvaluationTable.state == RUNNING) & (EvaluationTable.heartbeat_at < oldest)
-    return or_(EvaluationTable.state == QUEUED, is_orphaned)
+    is_orphaned = (EvaluationRow.state == RUNNING) & (EvaluationRow.heartbeat_at < oldest)
+    return or_(EvaluationRow.state == QUEUED, is_orphaned)
 
 
-def _is_held(evaluation: EvaluationTable, runner: str) -> bool:
+def _is_held(evaluation: EvaluationRow, runner: str) -> bool:
     return evaluation.state == RUNNING and evaluation.runner == runner
 
 
-def _ends_here(evaluation: EvaluationTable) -> bool:
+def _ends_here(evaluation: EvaluationRow) -> bool:
     """End an evaluation without a runner that was stopped or has used all attempts; returns whether it ended."""
     if evaluation.stop_at is not None:
         _end(evaluation, STOPPED)
@@ -239,9 +216,5 @@ def _ends_here(evaluation: EvaluationTable) -> bool:
     return True
 
 
-def _end(evaluation: EvaluationTable, state: str, error: dict[str, str] | None = None) -> None:
+def _end(evaluation: EvaluationRow, state: EvaluationState, error: dict[str, str] | None = None) -> None:
     evaluation.state, evaluation.error, evaluation.ended_at = state, error, datetime.now(UTC)
-
-
-def _row(evaluation: EvaluationTable) -> EvaluationRow:
-    return detached(EvaluationRow, evaluation)

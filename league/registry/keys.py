@@ -19,8 +19,7 @@ from league.refs import check_slug
 from league.registry import leagues
 from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, insert
-from league.registry.storage.rows import KeyRow, detached
-from league.registry.storage.tables import ApiKeyTable
+from league.registry.storage.rows import KeyRow
 
 PREFIX = "plk"
 SCOPES = ("act", "read", "evaluate", "promote")
@@ -53,8 +52,8 @@ class KeyRepository(Repository):
             "id": id_,
             "name": name,
             "sha256": digest(token.encode()),
-            "scopes": [scope for scope in SCOPES if scope in scopes],
-            "leagues": sorted(set(only_leagues)) or None,
+            "scopes": scopes,
+            "leagues": only_leagues or None,
             "rate": rate,
             "created_at": datetime.now(UTC),
             "expires_at": expires_at,
@@ -64,30 +63,30 @@ class KeyRepository(Repository):
             for league in only_leagues:
                 leagues.lock(session, league)  # until the key is stored, so that a new league of this name sees it
             change_counter.count(session, "keys")
-            if not insert(session, ApiKeyTable, [values]):
+            if not insert(session, KeyRow, [values]):
                 raise NameTaken(f"a key {name!r} exists or existed: names of keys are not reused")
-            return _row(session.get_one(ApiKeyTable, id_)), token
+            return session.get_one(KeyRow, id_), token
 
     def all(self) -> list[KeyRow]:
         """Return all API keys, revoked ones included, oldest first."""
-        query = select(ApiKeyTable).order_by(ApiKeyTable.created_at, ApiKeyTable.id)
+        query = select(KeyRow).order_by(KeyRow.created_at, KeyRow.id)
         with self._database.read() as session:
-            return [_row(key) for key in session.scalars(query)]
+            return list(session.scalars(query))
 
     def revoke(self, name: str) -> KeyRow:
         """Revoke an API key by its name or id. Idempotent. Raises UnknownKey, which lists the names."""
-        query = select(ApiKeyTable).where((ApiKeyTable.name == name) | (ApiKeyTable.id == name)).with_for_update()
+        query = select(KeyRow).where((KeyRow.name == name) | (KeyRow.id == name)).with_for_update()
         with self._database.write() as session:
             # A name takes precedence over an equal id of another key.
             keys = sorted(session.scalars(query), key=lambda key: key.name != name)
             if not keys:
-                names = ", ".join(session.scalars(select(ApiKeyTable.name).order_by(ApiKeyTable.name))) or "none yet"
+                names = ", ".join(session.scalars(select(KeyRow.name).order_by(KeyRow.name))) or "none yet"
                 raise UnknownKey(f"there is no key {name!r}; known: {names}")
             key = keys[0]
             if key.revoked_at is None:
                 change_counter.count(session, "keys")
                 key.revoked_at = datetime.now(UTC)
-            return _row(key)
+            return key
 
 
 def digest(token: bytes) -> str:
@@ -102,8 +101,3 @@ def _check(scopes: Collection[str], rate: float | None) -> None:
         raise InvalidInput(f"{problem}: expected some of {', '.join(SCOPES)}")
     if rate is not None and not 0 < rate < float("inf"):
         raise InvalidInput(f"rate {rate} must be a positive number of requests per second")
-
-
-def _row(key: ApiKeyTable) -> KeyRow:
-    only = None if key.leagues is None else frozenset(key.leagues)
-    return detached(KeyRow, key, scopes=frozenset(key.scopes), leagues=only)

@@ -17,16 +17,8 @@ from league.interface import Interface, digest
 from league.refs import check_new
 from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, insert, upsert
-from league.registry.storage.rows import EarlierGameRow, LeagueRow, detached, require_active
-from league.registry.storage.tables import (
-    READY,
-    ApiKeyTable,
-    EarlierGameTable,
-    LeagueTable,
-    MatchTable,
-    ScheduleTable,
-    VersionTable,
-)
+from league.registry.storage.rows import EarlierGameRow, KeyRow, LeagueRow
+from league.registry.storage.tables import READY, MatchTable, ScheduleTable, VersionTable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,7 +39,7 @@ class LeagueRepository(Repository):
         Raises LeagueArchived, InvalidReference for a new name that begins with `-`, or InterfaceChanged if published
         versions have another interface.
         """
-        values = {
+        values: dict[str, Any] = {
             "config": config.model_dump(mode="json", by_alias=True),
             "interface": interface.model_dump(mode="json"),
             "interface_digest": interface.digest(),
@@ -57,14 +49,15 @@ class LeagueRepository(Repository):
         }
         first = {"slug": config.league, "last_version": 0, "registered_at": datetime.now(UTC)}
         with self._database.write() as session:
-            if session.get(LeagueTable, config.league) is None:
+            if session.get(LeagueRow, config.league) is None:
                 check_new("league", config.league)
-            if insert(session, LeagueTable, [first | values]):
+            if insert(session, LeagueRow, [first | values]):
                 change_counter.count(session, "leagues")
                 _end_keys(session, config.league)
                 return
             row = lock_active(session, config.league)
-            if row.interface_digest != values["interface_digest"] and _has_versions(session, config.league):
+            ready = select(VersionTable.number).filter_by(league=config.league, state=READY).limit(1)
+            if row.interface_digest != values["interface_digest"] and session.scalar(ready) is not None:
                 raise InterfaceChanged(
                     f"league {config.league} has versions with other spaces or policies than this configuration: "
                     "keep them, or register the configuration under a new league name"
@@ -79,7 +72,7 @@ class LeagueRepository(Repository):
                 changes.insert(0, _describe_changes(row.game, game))
                 # Also without results: a match of a schedule that is open may still be recorded.
                 earlier = {"game": row.game, "replaced_at": datetime.now(UTC)}
-                upsert(session, EarlierGameTable, {"league": row.slug, "digest": row.game_digest}, earlier)
+                upsert(session, EarlierGameRow, {"league": row.slug, "digest": row.game_digest}, earlier)
             if changes and _has_results(session, row.slug):
                 is_back = _has_results(session, row.slug, Conditions(digest(game), selection))
                 logger.warning(
@@ -89,21 +82,22 @@ class LeagueRepository(Repository):
                     "Later" if is_back else "Earlier",
                     " The results from when the league last had this game count again." if is_back else "",
                 )
+            row.config_document, row.interface_document = values.pop("config"), values.pop("interface")
             for name, value in values.items():
                 setattr(row, name, value)
 
     def get(self, league: str) -> LeagueRow:
         """Return one league. Raises UnknownLeague."""
         with self._database.read() as session:
-            return _row(session.get(LeagueTable, league) or _unknown(session, league))
+            return session.get(LeagueRow, league) or _unknown(session, league)
 
     def earlier_games(self, league: str) -> list[EarlierGameRow]:
         """Return the other games that the league had, newest first. Raises UnknownLeague."""
-        table = EarlierGameTable
+        table = EarlierGameRow
         query = select(table).filter_by(league=league).order_by(table.replaced_at.desc(), table.digest)
         with self._database.read() as session:
-            row = session.get(LeagueTable, league) or _unknown(session, league)
-            return [detached(EarlierGameRow, game) for game in session.scalars(query) if game.digest != row.game_digest]
+            row = session.get(LeagueRow, league) or _unknown(session, league)
+            return list(session.scalars(query.where(table.digest != row.game_digest)))
 
     def unregistered_change(self, league: str) -> str | None:
         """Describe how the game of a league has changed since it was registered, whose results still count.
@@ -132,11 +126,11 @@ class LeagueRepository(Repository):
         with self._database.write() as session:
             row = lock(session, league)
             row.archived_at = None if undo else row.archived_at or datetime.now(UTC)
-            return _row(row)
+            return row
 
     def names(self) -> dict[str, datetime | None]:
         """Return league → since when it is archived, sorted by name. Does not read configurations."""
-        query = select(LeagueTable.slug, LeagueTable.archived_at).order_by(LeagueTable.slug)
+        query = select(LeagueRow.slug, LeagueRow.archived_at).order_by(LeagueRow.slug)
         with self._database.read() as session:
             return dict(session.execute(query).tuples().all())
 
@@ -149,7 +143,7 @@ class LeagueRepository(Repository):
         """Return league → ids of its policies, sorted by name. Does not read configurations, of which one may be from
         another release. Leaves out leagues whose interface is.
         """
-        query = select(LeagueTable.slug, LeagueTable.interface).order_by(LeagueTable.slug)
+        query = select(LeagueRow.slug, LeagueRow.interface_document).order_by(LeagueRow.slug)
         policy_ids = {}
         with self._database.read() as session:
             for league, interface in session.execute(query):
@@ -160,33 +154,33 @@ class LeagueRepository(Repository):
 
 def require(session: Session, league: str) -> None:
     """Raise UnknownLeague, which lists the known leagues, unless the league is registered."""
-    if session.scalar(select(LeagueTable.slug).filter_by(slug=league)) is None:
+    if session.scalar(select(LeagueRow.slug).filter_by(slug=league)) is None:
         _unknown(session, league)
 
 
-def lock(session: Session, league: str) -> LeagueTable:
+def lock(session: Session, league: str) -> LeagueRow:
     """Lock a league until the transaction ends. Raises UnknownLeague.
 
     Rows that only refer to the league can still be inserted (key_share). On SQLite the transaction is the lock.
     """
-    return session.get(LeagueTable, league, with_for_update={"key_share": True}) or _unknown(session, league)
+    return session.get(LeagueRow, league, with_for_update={"key_share": True}) or _unknown(session, league)
 
 
-def lock_active(session: Session, league: str) -> LeagueTable:
+def lock_active(session: Session, league: str) -> LeagueRow:
     """Lock a league until the transaction ends. Raises UnknownLeague or LeagueArchived."""
     row = lock(session, league)
-    require_active(league, row.archived_at)
+    row.require_active()
     return row
 
 
 def _end_keys(session: Session, league: str) -> None:
     """End the validity of keys for a removed league of this name: this one is another."""
-    query = select(ApiKeyTable).where(ApiKeyTable.revoked_at.is_(None)).with_for_update()
+    query = select(KeyRow).where(KeyRow.revoked_at.is_(None)).with_for_update()
     for key in session.scalars(query):
         if key.leagues is None or league not in key.leagues:
             continue
         change_counter.count(session, "keys")
-        if other_leagues := [name for name in key.leagues if name != league]:
+        if other_leagues := key.leagues - {league}:
             key.leagues = other_leagues
         else:
             key.revoked_at = datetime.now(UTC)
@@ -194,19 +188,17 @@ def _end_keys(session: Session, league: str) -> None:
 
 def _action_selections(session: Session, league: str | None = None) -> dict[str, ActionSelection]:
     """league → action selection, of all leagues or of one."""
-    configured_actions, interface = LeagueTable.config["play"]["actions"].as_string(), LeagueTable.interface
+    configured_actions, interface = (
+        LeagueRow.config_document["play"]["actions"].as_string(),
+        LeagueRow.interface_document,
+    )
     hidden, simultaneous = (interface[key].as_boolean() for key in ("hidden_information", "simultaneous"))
-    query = select(LeagueTable.slug, configured_actions, hidden, simultaneous, interface["sides"])
-    rows = session.execute(query if league is None else query.where(LeagueTable.slug == league))
+    query = select(LeagueRow.slug, configured_actions, hidden, simultaneous, interface["sides"])
+    rows = session.execute(query if league is None else query.where(LeagueRow.slug == league))
     return {
         slug: actions or default_selection(bool(is_hidden or at_once), len(sides or ()))
         for slug, actions, is_hidden, at_once, sides in rows
     }
-
-
-def _has_versions(session: Session, league: str) -> bool:
-    ready = select(VersionTable.number).filter_by(league=league, state=READY)
-    return session.scalar(ready.limit(1)) is not None
 
 
 def _has_results(session: Session, league: str, conditions: Conditions | None = None) -> bool:
@@ -226,14 +218,7 @@ def _describe_changes(before: dict[str, Any], now: dict[str, Any]) -> str:
     )
 
 
-def _unknown(session: Session, league: str) -> LeagueTable:
-    slugs = list(session.scalars(select(LeagueTable.slug).order_by(LeagueTable.slug)))
+def _unknown(session: Session, league: str) -> LeagueRow:
+    slugs = list(session.scalars(select(LeagueRow.slug).order_by(LeagueRow.slug)))
     guess = "".join(f", did you mean {name!r}?" for name in difflib.get_close_matches(league, slugs, n=1))
     raise UnknownLeague(f"there is no league {league!r}{guess or '; known: ' + (', '.join(slugs) or 'none yet')}")
-
-
-def _row(league: LeagueTable) -> LeagueRow:
-    from league.config.league import LeagueConfig  # Takes 0.05 s to import, and most commands read versions only.
-
-    config = LeagueConfig.from_mapping(league.config, source=f"the registered league {league.slug}")
-    return detached(LeagueRow, league, config=config, interface=Interface.model_validate(league.interface))

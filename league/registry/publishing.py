@@ -31,8 +31,8 @@ from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository, row_count
 from league.registry.storage.manifest import EXPLOITER, MIXTURE, Manifest
 from league.registry.storage.mixture import Member, Mixture, normalised
-from league.registry.storage.rows import VersionRow
-from league.registry.storage.tables import ABANDONED, PUBLISHING, READY, LeagueTable, VersionTable
+from league.registry.storage.rows import LeagueRow, VersionRow
+from league.registry.storage.tables import ABANDONED, PUBLISHING, READY, VersionTable
 from league.registry.versions import VersionRepository
 
 PUBLICATION_TIMEOUT = timedelta(days=1)
@@ -61,7 +61,20 @@ class VersionPublisher(Repository):
             if (ready := versions.find_by_source(session, league, source)) is None:
                 number = reserve(session, league, source, parent, above=self._artifacts.last(league))
         if ready is None:
-            ready = self._build(league, number, build, source, parent)
+            try:
+                staging = self._artifacts.stage(league, number)
+                with disk_errors(staging, only=DISK_FULL_OR_READ_ONLY):
+                    manifest = build(staging, number)
+                check(manifest, league, number, parent)
+                text = self._artifacts.commit(manifest)
+                with self._database.write() as session:
+                    ready = finish(session, manifest, text, source)
+            finally:
+                with suppress(StorageError):  # otherwise, a later sweep removes it
+                    with self._database.write() as session:
+                        abandoned = abandon(session, league, number)
+                    if abandoned:
+                        self._clear(league, number)
         return self._versions.get(league, ready)
 
     def publish_mixture(self, league: str, shares: Mapping[int, float]) -> VersionRow:
@@ -85,7 +98,7 @@ class VersionPublisher(Repository):
         probabilities = normalised(shares)
         members = [self._versions.get(league, number) for number in probabilities]
         with self._database.read() as session:
-            interface_digest = session.get_one(LeagueTable, league).interface_digest
+            interface_digest = session.get_one(LeagueRow, league).interface_digest
         for member in members:
             _check_member(member, members[0], interface_digest)
         mixture = Mixture(
@@ -103,27 +116,6 @@ class VersionPublisher(Repository):
             numbers = stale(session, league)
         for number in numbers:
             self._clear(league, number)
-
-    def _build(self, league: str, number: int, build: Build, source: str, parent: int | None) -> int:
-        """Write a reserved version; returns the number of the version that is ready."""
-        try:
-            staging = self._artifacts.stage(league, number)
-            with disk_errors(staging, only=DISK_FULL_OR_READ_ONLY):
-                manifest = build(staging, number)
-            check(manifest, league, number, parent)
-            text = self._artifacts.commit(manifest)
-            with self._database.write() as session:
-                return finish(session, manifest, text, source)
-        finally:
-            self._withdraw_unfinished(league, number)
-
-    def _withdraw_unfinished(self, league: str, number: int) -> None:
-        """Remove a version that is not ready. If that fails, a later sweep removes it."""
-        with suppress(StorageError):
-            with self._database.write() as session:
-                abandoned = abandon(session, league, number)
-            if abandoned:
-                self._clear(league, number)
 
     def _clear(self, league: str, number: int) -> None:
         self._artifacts.discard(league, number)

@@ -8,7 +8,7 @@ All times are those of the database's clock, because the clocks of replicas may 
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from typing import Any, NamedTuple
@@ -21,16 +21,15 @@ from league.registry import leagues, processes, traffic
 from league.registry.storage.database import Repository, clock, insert, row_count, sql_clock, upsert, upsert_all
 from league.registry.storage.rows import (
     Acknowledgement,
+    AliasEvent,
     AliasTarget,
     ReadPosition,
     RegisteredReplica,
     ServedState,
     ShadowCounts,
-    detached,
 )
 from league.registry.storage.tables import (
     AcknowledgementTable,
-    AliasEventTable,
     AliasTable,
     ReplicaReportTable,
     ReplicaTable,
@@ -48,6 +47,9 @@ DRAINING = "draining"
 _UPDATE = update(ReplicaTable).where(ReplicaTable.replica == bindparam("name"))
 _UPDATE_NOW = _UPDATE.values(seen_at=func.clock_timestamp())
 """Built once, since replicas execute them again and again."""
+
+
+STATE = [state.name for state in fields(ServedState)]
 
 
 class ReplicaCounts(NamedTuple):
@@ -182,12 +184,30 @@ def acknowledgements(session: Session, league: str) -> list[Acknowledgement]:
     """Return what each registered replica serves of a league, by replica. Raises UnknownLeague."""
     leagues.require(session, league)
     current_time = clock(session)
-    state_at = cache(lambda event, setting: _required(session, league, event, setting))
+
+    @cache
+    def state_at(event: int | None, setting: int | None) -> ServedState:
+        """What the registry required when `event` and `setting` were the newest that a replica had read."""
+        if event is None:
+            return ServedState()
+        targets = _aliases_at(session, league, event)
+        aliases = {alias: target.version for alias, target in targets.items()}
+        version = aliases.get(CHAMPION)
+        followed = traffic.setting_at(session, league, setting or 0)
+        pinned = () if followed is None else (followed.canary, followed.shadow)
+        numbers = {str(one.version): one.version for one in pinned if one and isinstance(one.version, int)}
+        return ServedState(
+            version=version,
+            sha256=session.scalar(select(VersionTable.sha256).filter_by(league=league, number=version)),
+            aliases=aliases | numbers,
+            event=max((target.event for target in targets.values()), default=None),
+            traffic=followed.id if followed else None,
+        )
+
     query = select(ReplicaTable, AcknowledgementTable).select_from(with_acknowledgement(league))
     return [
-        detached(
-            Acknowledgement,
-            row or state_at(replica.event, replica.traffic),
+        Acknowledgement(
+            **{name: getattr(row or state_at(replica.event, replica.traffic), name) for name in STATE},
             replica=replica.replica,
             league=league,
             seen_at=replica.seen_at,
@@ -228,33 +248,13 @@ def serving(session: Session, league: str, since: timedelta) -> dict[int, int]:
     return dict(sorted(replica_counts.items()))
 
 
-def _required(session: Session, league: str, event: int | None, setting: int | None) -> ServedState:
-    """What the registry required of a league when `event` and `setting` were the newest that a replica had read."""
-    if event is None:
-        return ServedState()
-    targets = _aliases_at(session, league, event)
-    aliases = {alias: target.version for alias, target in targets.items()}
-    version = aliases.get(CHAMPION)
-    sha256 = session.scalar(select(VersionTable.sha256).filter_by(league=league, number=version))
-    followed = traffic.setting_at(session, league, setting or 0)
-    pinned = () if followed is None else (followed.canary, followed.shadow)
-    numbers = {str(one.version): one.version for one in pinned if one and isinstance(one.version, int)}
-    return ServedState(
-        version=version,
-        sha256=sha256,
-        aliases=aliases | numbers,
-        event=max((target.event for target in targets.values()), default=None),
-        traffic=followed.id if followed else None,
-    )
-
-
 def _aliases_at(session: Session, league: str, event: int) -> dict[str, AliasTarget]:
     """Return alias → its target when `event` was the newest."""
     query = select(AliasTable.name, AliasTable.version, AliasTable.event).filter_by(league=league)
     targets = {alias: AliasTarget(version, moved) for alias, version, moved in session.execute(query)}
     for alias in [alias for alias, target in targets.items() if target.event > event]:
         del targets[alias]
-        table = AliasEventTable
+        table = AliasEvent
         earlier = select(table.version, table.id).filter_by(league=league, alias=alias).where(table.id <= event)
         if target := session.execute(earlier.order_by(table.id.desc()).limit(1)).one_or_none():
             targets[alias] = AliasTarget(*target)
@@ -266,7 +266,7 @@ def _registered(session: Session, condition: ColumnElement[bool]) -> list[Regist
     if not rows:
         return []
     current_time = clock(session)
-    return [detached(RegisteredReplica, row, silence=current_time - row.seen_at) for row in rows]
+    return [RegisteredReplica(row.replica, row.process, row.seen_at, current_time - row.seen_at) for row in rows]
 
 
 def _remove(session: Session, replica: str) -> None:

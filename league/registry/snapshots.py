@@ -15,17 +15,8 @@ from league.interface import digest
 from league.refs import CHAMPION
 from league.registry import leagues
 from league.registry.storage.database import Repository, upsert
-from league.registry.storage.rows import SnapshotRow, detached
-from league.registry.storage.tables import (
-    READY,
-    AliasEventTable,
-    LeagueTable,
-    MatchTable,
-    ScheduleTable,
-    SnapshotTable,
-    VerdictTable,
-    VersionTable,
-)
+from league.registry.storage.rows import AliasEvent, LeagueRow, SnapshotRow, VerdictRow
+from league.registry.storage.tables import READY, MatchTable, ScheduleTable, VersionTable
 from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
@@ -45,15 +36,13 @@ _COUNTS: dict[str, Executable] = {
     .where(ScheduleTable.purged_at.is_not(None))
     .group_by(ScheduleTable.league),
     "versions": select(VersionTable.league, func.count()).filter_by(state=READY).group_by(VersionTable.league),
-    "promotions": select(AliasEventTable.league, func.count())
-    .filter_by(alias=CHAMPION)
-    .group_by(AliasEventTable.league),
+    "promotions": select(AliasEvent.league, func.count()).filter_by(alias=CHAMPION).group_by(AliasEvent.league),
     "verdicts, closed, void": select(
-        VerdictTable.league,
+        VerdictRow.league,
         func.count(),
-        func.count(VerdictTable.outcome),
-        func.count().filter(VerdictTable.outcome == VOID),
-    ).group_by(VerdictTable.league),
+        func.count(VerdictRow.outcome),
+        func.count().filter(VerdictRow.outcome == VOID),
+    ).group_by(VerdictRow.league),
 }
 """Counts that grow with every change of the data behind a snapshot: none of these rows is deleted or changed."""
 
@@ -64,11 +53,11 @@ class SnapshotRepository(Repository):
     def get(self, league: str, part: str) -> SnapshotRow | None:
         """Return a part of a league's snapshots, None if it was not computed yet. Raises UnknownLeague."""
         with self._database.read() as session:
-            snapshot = session.get(SnapshotTable, (league, part))
+            snapshot = session.get(SnapshotRow, (league, part))
             if snapshot is None:
                 leagues.require(session, league)
                 return None
-            return _row(snapshot)
+            return snapshot
 
     def current(self, league: str, part: str) -> SnapshotRow | None:
         """Return a part that was computed from the league's current data, else None. Raises UnknownLeague."""
@@ -77,9 +66,9 @@ class SnapshotRepository(Repository):
 
     def of_part(self, part: str) -> dict[str, SnapshotRow]:
         """Return league → this part, of the leagues that have it."""
-        query = select(SnapshotTable).filter_by(part=part).order_by(SnapshotTable.league)
+        query = select(SnapshotRow).filter_by(part=part).order_by(SnapshotRow.league)
         with self._database.read() as session:
-            return {snapshot.league: _row(snapshot) for snapshot in session.scalars(query)}
+            return {snapshot.league: snapshot for snapshot in session.scalars(query)}
 
     def verdict_reasons(self, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
         """Return verdict → outcome and reason in its snapshot, of the verdicts that have one.
@@ -87,16 +76,16 @@ class SnapshotRepository(Repository):
         The rest of the documents, which is long, is not read.
         """
         parts = {f"verdict/{verdict}": verdict for verdict in verdicts}
-        fields = (SnapshotTable.document[name].as_string() for name in ("outcome", "reason"))
-        query = select(SnapshotTable.part, *fields)
-        query = query.where(SnapshotTable.league == league, SnapshotTable.part.in_(parts))
+        fields = (SnapshotRow.document[name].as_string() for name in ("outcome", "reason"))
+        query = select(SnapshotRow.part, *fields)
+        query = query.where(SnapshotRow.league == league, SnapshotRow.part.in_(parts))
         with self._database.read() as session:
             return {parts[part]: (outcome, reason) for part, outcome, reason in session.execute(query)}
 
     def marks(self, league: str) -> dict[str, str]:
         """Return part → the mark that it was computed from, of all parts of a league."""
         with self._database.read() as session:
-            rows = session.execute(select(SnapshotTable.part, SnapshotTable.mark).filter_by(league=league))
+            rows = session.execute(select(SnapshotRow.part, SnapshotRow.mark).filter_by(league=league))
             return dict(rows.tuples().all())
 
     def put(self, league: str, documents: Mapping[str, Any], mark: str) -> None:
@@ -109,7 +98,7 @@ class SnapshotRepository(Repository):
             leagues.require(session, league)
             for part, document in documents.items():
                 values = {"mark": mark, "document": document, "at": stored_at}
-                upsert(session, SnapshotTable, {"league": league, "part": part}, values)
+                upsert(session, SnapshotRow, {"league": league, "part": part}, values)
 
     def current_marks(self) -> dict[str, str]:
         """Return league → the mark of its current data, of all leagues."""
@@ -118,7 +107,7 @@ class SnapshotRepository(Repository):
 
     def stale(self) -> list[str]:
         """Return the leagues whose snapshots are outdated: leagues without snapshots first, then the oldest."""
-        query = select(SnapshotTable.league, SnapshotTable.mark, SnapshotTable.at).filter_by(part=SUMMARY)
+        query = select(SnapshotRow.league, SnapshotRow.mark, SnapshotRow.at).filter_by(part=SUMMARY)
         with self._database.read() as session:
             snapshots = {league: (mark, at) for league, mark, at in session.execute(query)}
             current = _current_marks(session)
@@ -133,12 +122,8 @@ def _current_marks(session: Session) -> dict[str, str]:
     for name, query in _COUNTS.items():
         for league, *values in session.execute(query):
             counts[league].append(f"{name}: {' '.join(map(str, values))}")
-    table = LeagueTable
+    table = LeagueRow
     registered = session.execute(
-        select(table.slug, table.config, table.interface, table.game_digest).order_by(table.slug)
+        select(table.slug, table.config_document, table.interface_document, table.game_digest).order_by(table.slug)
     )
     return {league: "; ".join([str(FORMAT), digest(values)[:12], *counts[league]]) for league, *values in registered}
-
-
-def _row(snapshot: SnapshotTable) -> SnapshotRow:
-    return detached(SnapshotRow, snapshot)

@@ -21,7 +21,7 @@ from league.registry import leagues, versions
 from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, repeat_after_deadlock, upsert
 from league.registry.storage.idempotency import IdempotentCall, apply_once
-from league.registry.storage.rows import Portion, ShadowCounts, Traffic, detached
+from league.registry.storage.rows import Portion, ShadowCounts, Traffic
 from league.registry.storage.tables import ShadowCountTable, TrafficEventTable
 
 SHADOW_COUNTS_KEPT = timedelta(days=90)
@@ -59,13 +59,25 @@ class TrafficRepository(Repository):
         """
         with self._database.write() as session:
             leagues.lock(session, league)
-            return apply_once(
-                session,
-                call,
-                "traffic",
-                change=lambda: _set(session, league, canary, shadow, actor=actor, reason=reason),
-                load=lambda event: _row(session.get_one(TrafficEventTable, event)),
-            )
+
+            def change() -> Traffic:
+                setting = current_setting(session, league)
+                new_portions = (
+                    setting.canary if isinstance(canary, Unchanged) else canary,
+                    setting.shadow if isinstance(shadow, Unchanged) else shadow,
+                )
+                for portion in (canary, shadow):
+                    if isinstance(portion, Portion):
+                        _check(session, league, portion)
+                if setting.id is not None and new_portions == (setting.canary, setting.shadow):
+                    return setting
+                change_counter.count(session, "traffic")
+                return _record(session, league, *new_portions, actor=actor, reason=reason)
+
+            def load(event: int) -> Traffic:
+                return _row(session.get_one(TrafficEventTable, event))
+
+            return apply_once(session, call, "traffic", change=change, load=load)
 
     def current(self, league: str) -> Traffic:
         """Return the setting in force; without an id if none was ever set. Raises UnknownLeague."""
@@ -107,29 +119,6 @@ def write_shadow_counts(session: Session, replica: str, counts: Collection[Shado
         key = {"replica": replica} | {name: values.pop(name) for name in ("league", "candidate", "champion")}
         upsert(session, ShadowCountTable, key, values | {"latency": list(count.latency), "at": written_at})
     session.execute(delete(ShadowCountTable).where(ShadowCountTable.at < written_at - SHADOW_COUNTS_KEPT))
-
-
-def _set(
-    session: Session,
-    league: str,
-    canary: Portion | Unchanged | None,
-    shadow: Portion | Unchanged | None,
-    *,
-    actor: str,
-    reason: str,
-) -> Traffic:
-    setting = current_setting(session, league)
-    new_portions = (
-        setting.canary if isinstance(canary, Unchanged) else canary,
-        setting.shadow if isinstance(shadow, Unchanged) else shadow,
-    )
-    for portion in (canary, shadow):
-        if isinstance(portion, Portion):
-            _check(session, league, portion)
-    if setting.id is not None and new_portions == (setting.canary, setting.shadow):
-        return setting
-    change_counter.count(session, "traffic")
-    return _record(session, league, *new_portions, actor=actor, reason=reason)
 
 
 def end(session: Session, league: str, portions: Collection[str], *, actor: str, reason: str) -> None:
@@ -176,8 +165,15 @@ def _check(session: Session, league: str, portion: Portion) -> None:
 
 
 def _row(event: TrafficEventTable) -> Traffic:
-    canary, shadow = _portion(event.canary, event.canary_share), _portion(event.shadow, event.shadow_share)
-    return detached(Traffic, event, canary=canary, shadow=shadow)
+    return Traffic(
+        league=event.league,
+        id=event.id,
+        canary=_portion(event.canary, event.canary_share),
+        shadow=_portion(event.shadow, event.shadow_share),
+        actor=event.actor,
+        reason=event.reason,
+        at=event.at,
+    )
 
 
 def _portion(version: str | None, share: float | None) -> Portion | None:

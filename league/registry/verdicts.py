@@ -15,8 +15,7 @@ from league.errors import Conflict, InvalidInput, InvalidReference, UnknownVerdi
 from league.refs import SHORT_VERDICT, VERDICT, verdict_digest
 from league.registry import leagues, versions
 from league.registry.storage.database import Repository, insert, repeat_after_deadlock
-from league.registry.storage.rows import NightlyRunRow, VerdictRow, detached
-from league.registry.storage.tables import AliasEventTable, NightlyRunTable, VerdictTable
+from league.registry.storage.rows import AliasEvent, NightlyRunRow, VerdictRow
 from league.verdict_tests import CompanionTests, ExploitabilityTest
 
 VOID = "void"
@@ -36,12 +35,12 @@ class VerdictRepository(Repository):
         values = {"league": league, "candidate": candidate, "champion": champion, "settings": settings}
         with self._database.write() as session:
             versions.require(session, league, candidate)
-            insert(session, VerdictTable, [values | {"id": schedule, "opened_at": datetime.now(UTC)}])
-            verdict = session.get_one(VerdictTable, schedule)
+            insert(session, VerdictRow, [values | {"id": schedule, "opened_at": datetime.now(UTC)}])
+            verdict = session.get_one(VerdictRow, schedule)
             for name, value in values.items():
                 if (stored_value := getattr(verdict, name)) != value:
                     raise Conflict(f"verdict {schedule} was opened with {name} {stored_value!r}, not {value!r}")
-            return _row(verdict)
+            return verdict
 
     @repeat_after_deadlock
     def settle(self, verdict: str, test: ExploitabilityTest) -> VerdictRow:
@@ -50,16 +49,16 @@ class VerdictRepository(Repository):
         Other verdicts stay as they are. Raises UnknownVerdict.
         """
         with self._database.write() as session:
-            row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
+            row = session.get(VerdictRow, verdict, with_for_update=True) or _unknown(verdict)
             if row.outcome is None and CompanionTests.of_settings(row.settings).awaits_exploiters:
                 row.settings = row.settings | {"exploitability": test.to_record()}
-            return _row(row)
+            return row
 
     @repeat_after_deadlock
     def close(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
         """Record the outcome of a verdict. Idempotent. Raises UnknownVerdict, or Conflict if it has another outcome."""
         with self._database.write() as session:
-            row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
+            row = session.get(VerdictRow, verdict, with_for_update=True) or _unknown(verdict)
             if row.outcome is None:
                 row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
             elif row.outcome != outcome:
@@ -73,20 +72,20 @@ class VerdictRepository(Repository):
         Raises UnknownVerdict, or Conflict while its promotion is being applied.
         """
         with self._database.write() as session:
-            row = session.get(VerdictTable, verdict, with_for_update=True) or _unknown(verdict)
+            row = session.get(VerdictRow, verdict, with_for_update=True) or _unknown(verdict)
             if row.outcome is None:
                 leagues.lock(session, row.league)
-                if session.scalars(select(AliasEventTable).filter_by(verdict=verdict)).first() is not None:
+                if session.scalars(select(AliasEvent).filter_by(verdict=verdict)).first() is not None:
                     raise Conflict(f"the promotion of verdict {verdict} is being applied: void it once it is closed")
             if row.outcome != VOID:
                 row.outcome, row.evidence = VOID, {**(row.evidence or {}), "note": note}
                 row.closed_at = row.closed_at or datetime.now(UTC)
-            return _row(row)
+            return row
 
     def get(self, verdict: str) -> VerdictRow:
         """Return one verdict. Raises UnknownVerdict."""
         with self._database.read() as session:
-            return _row(session.get(VerdictTable, verdict) or _unknown(verdict))
+            return session.get(VerdictRow, verdict) or _unknown(verdict)
 
     def find(self, text: str, league: str | None = None) -> VerdictRow:
         """Return the verdict with this id, or the only one whose id or digest begins with it.
@@ -95,14 +94,14 @@ class VerdictRepository(Repository):
 
         Raises UnknownLeague, UnknownVerdict, or InvalidReference with the candidates if there are several.
         """
-        table = VerdictTable
+        table = VerdictRow
         begins = table.id.startswith(text, autoescape=True) | table.id.contains(VERDICT + text, autoescape=True)
         with self._database.read() as session:
             if league is not None:
                 leagues.require(session, league)
             if (exact := session.get(table, text)) is not None and league in (None, exact.league):
-                return _row(exact)
-            rows = [_row(row) for row in session.scalars(select(table).where(begins).order_by(table.id))]
+                return exact
+            rows = list(session.scalars(select(table).where(begins).order_by(table.id)))
         verdicts = [
             row
             for row in rows
@@ -116,10 +115,10 @@ class VerdictRepository(Repository):
 
     def all(self, league: str) -> list[VerdictRow]:
         """Return all verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
-        query = select(VerdictTable).filter_by(league=league).order_by(VerdictTable.opened_at, VerdictTable.id)
+        query = select(VerdictRow).filter_by(league=league).order_by(VerdictRow.opened_at, VerdictRow.id)
         with self._database.read() as session:
             leagues.require(session, league)
-            return [_row(verdict) for verdict in session.scalars(query)]
+            return list(session.scalars(query))
 
     def newest(self, league: str, *, before: str | None = None, limit: int = 20) -> list[VerdictRow]:
         """Return at most `limit` verdicts of a league, newest first.
@@ -127,7 +126,7 @@ class VerdictRepository(Repository):
         before: return only verdicts opened before this one.
         Raises UnknownLeague, or InvalidInput if `before` is not a verdict of the league.
         """
-        table = VerdictTable
+        table = VerdictRow
         query = select(table).filter_by(league=league).order_by(table.opened_at.desc(), table.id.desc()).limit(limit)
         with self._database.read() as session:
             leagues.require(session, league)
@@ -136,16 +135,16 @@ class VerdictRepository(Repository):
                 if last is None or last.league != league:
                     raise InvalidInput(f"before: league {league} has no verdict {before!r}")
                 query = query.where(tuple_(table.opened_at, table.id) < (last.opened_at, last.id))
-            return [_row(verdict) for verdict in session.scalars(query)]
+            return list(session.scalars(query))
 
     def last_closed(self) -> dict[str, VerdictRow]:
         """Return league → the verdict that was closed last, of the leagues that have one."""
-        table = VerdictTable
+        table = VerdictRow
         closed = select(table).where(table.closed_at.is_not(None)).order_by(table.closed_at, table.id)
         latest = select(table.league, func.max(table.closed_at).label("at")).group_by(table.league).subquery()
         is_latest = (table.league == latest.c.league) & (table.closed_at == latest.c.at)
         with self._database.read() as session:
-            return {verdict.league: _row(verdict) for verdict in session.scalars(closed.join(latest, is_latest))}
+            return {verdict.league: verdict for verdict in session.scalars(closed.join(latest, is_latest))}
 
 
 class NightlyRunRepository(Repository):
@@ -156,25 +155,25 @@ class NightlyRunRepository(Repository):
         """Open a nightly run that judges `candidates`, or return the one that is open. Raises UnknownLeague."""
         with self._database.write() as session:
             leagues.lock(session, league)
-            run = session.scalars(select(NightlyRunTable).filter_by(league=league, ended_at=None)).first()
+            run = session.scalars(select(NightlyRunRow).filter_by(league=league, ended_at=None)).first()
             if run is None:
                 began_at = datetime.now(UTC)
-                run = NightlyRunTable(league=league, candidates=sorted(candidates), alpha=alpha, began_at=began_at)
+                run = NightlyRunRow(league=league, candidates=tuple(sorted(candidates)), alpha=alpha, began_at=began_at)
                 session.add(run)
                 session.flush()
-            return _nightly_row(run)
+            return run
 
     @repeat_after_deadlock
     def close(self, run: int, report: dict[str, Any] | None) -> None:
         """End a nightly run and store its report. Idempotent."""
         with self._database.write() as session:
-            row = session.get_one(NightlyRunTable, run)
+            row = session.get_one(NightlyRunRow, run)
             if row.ended_at is None:
                 row.report, row.ended_at = report, datetime.now(UTC)
 
     def last_ended(self) -> dict[str, datetime]:
         """Return league → when its last nightly run ended, of the leagues that have had one."""
-        table = NightlyRunTable
+        table = NightlyRunRow
         query = select(table.league, func.max(table.ended_at)).where(table.ended_at.is_not(None))
         with self._database.read() as session:
             rows = session.execute(query.group_by(table.league)).tuples()
@@ -182,15 +181,15 @@ class NightlyRunRepository(Repository):
 
     def all(self, league: str) -> list[NightlyRunRow]:
         """Return all nightly runs of a league, oldest first. Raises UnknownLeague."""
-        query = select(NightlyRunTable).filter_by(league=league).order_by(NightlyRunTable.id)
+        query = select(NightlyRunRow).filter_by(league=league).order_by(NightlyRunRow.id)
         with self._database.read() as session:
             leagues.require(session, league)
-            return [_nightly_row(run) for run in session.scalars(query)]
+            return list(session.scalars(query))
 
 
 def require_open(session: Session, verdict: str) -> None:
     """Raise Conflict if a verdict has been closed."""
-    row = session.get(VerdictTable, verdict)
+    row = session.get(VerdictRow, verdict)
     if row is not None and row.outcome is not None:
         raise Conflict(f"verdict {verdict} is {row.outcome!r}: it cannot promote a version")
 
@@ -208,13 +207,5 @@ def _candidates(rows: Sequence[VerdictRow]) -> str:
     return ", ".join(listed) + more
 
 
-def _unknown(verdict: str) -> VerdictTable:
+def _unknown(verdict: str) -> VerdictRow:
     raise UnknownVerdict(f"there is no verdict {verdict!r}")
-
-
-def _row(verdict: VerdictTable) -> VerdictRow:
-    return detached(VerdictRow, verdict)
-
-
-def _nightly_row(run: NightlyRunTable) -> NightlyRunRow:
-    return detached(NightlyRunRow, run, candidates=tuple(run.candidates))

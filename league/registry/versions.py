@@ -14,7 +14,7 @@ from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
 from league.registry.storage.manifest import EXPLOITER, MIXTURE, TRAINING, Manifest
 from league.registry.storage.mixture import Mixture
-from league.registry.storage.rows import Note, VersionRow, VersionState, detached
+from league.registry.storage.rows import Note, VersionRow, VersionState
 from league.registry.storage.tables import READY, AliasTable, VersionNoteTable, VersionTable
 
 MAX_NOTE_LENGTH = 2000
@@ -135,9 +135,19 @@ class VersionRepository(Repository):
 
         Raises UnknownLeague, UnknownVersion, UnknownAlias or InvalidInput.
         """
+        text = text.strip()
+        if len(text) > MAX_NOTE_LENGTH or "\0" in text:
+            raise InvalidInput(
+                f"a note must be at most {MAX_NOTE_LENGTH} characters without a zero byte, got {len(text)}"
+            )
         with self._database.write() as session:
             version = resolve(session, ref)
-            _write_note(session, version.league, version.number, text, actor)
+            if text != (version.note.text if version.note else ""):
+                note = VersionNoteTable(
+                    league=version.league, version=version.number, text=text, actor=actor, at=datetime.now(UTC)
+                )
+                session.add(note)
+                session.flush()
             return _get(session, version.league, version.number)
 
 
@@ -224,17 +234,6 @@ def _unknown(session: Session, league: str, number: int) -> VersionRow:
     raise UnknownVersion(f"league {league} has no version {number}; {newest}")
 
 
-def _write_note(session: Session, league: str, version: int, text: str, actor: str) -> None:
-    text = text.strip()
-    if len(text) > MAX_NOTE_LENGTH or "\0" in text:
-        raise InvalidInput(f"a note must be at most {MAX_NOTE_LENGTH} characters without a zero byte, got {len(text)}")
-    before = _notes(session, league, [version]).get(version)
-    if text == (before.text if before else ""):
-        return
-    session.add(VersionNoteTable(league=league, version=version, text=text, actor=actor, at=datetime.now(UTC)))
-    session.flush()
-
-
 def _notes(session: Session, league: str, versions: Collection[int]) -> dict[int, Note]:
     """Return version → its newest note, without empty ones."""
     if not versions:
@@ -257,5 +256,13 @@ def _rows(session: Session, league: str, versions: list[VersionTable]) -> list[V
 def _row(version: VersionTable, aliases: tuple[str, ...], note: Note | None) -> VersionRow:
     assert version.manifest is not None, "a ready version has a manifest"
     assert version.sha256 is not None, "a ready version has a digest"
-    manifest = Manifest.from_json(version.manifest, source=f"the manifest of {version.league}@{version.number}")
-    return detached(VersionRow, version, manifest=manifest, aliases=aliases, note=note)
+    return VersionRow(
+        league=version.league,
+        number=version.number,
+        source=version.source,
+        sha256=version.sha256,
+        manifest=Manifest.from_json(version.manifest, source=f"the manifest of {version.league}@{version.number}"),
+        aliases=aliases,
+        note=note,
+        retired_at=version.retired_at,
+    )

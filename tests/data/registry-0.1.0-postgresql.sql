@@ -256,6 +256,7 @@ CREATE SEQUENCE traffic_events_id_seq
 ALTER SEQUENCE traffic_events_id_seq OWNED BY traffic_events.id;
 CREATE TABLE training_nights (
     id integer NOT NULL,
+    number integer NOT NULL,
     league character varying(255) NOT NULL,
     parent integer,
     steps json NOT NULL,
@@ -318,48 +319,48 @@ ALTER TABLE ONLY schedules ALTER COLUMN sequence SET DEFAULT nextval('schedules_
 ALTER TABLE ONLY traffic_events ALTER COLUMN id SET DEFAULT nextval('traffic_events_id_seq'::regclass);
 ALTER TABLE ONLY training_nights ALTER COLUMN id SET DEFAULT nextval('training_nights_id_seq'::regclass);
 ALTER TABLE ONLY version_notes ALTER COLUMN id SET DEFAULT nextval('version_notes_id_seq'::regclass);
-INSERT INTO acknowledgements VALUES ('replica-2', 'tictactoe', 1, '0000000000000000000000000000000000000000000000000000000000000000', 'it is loading', '{"champion": 1}', 1, 3, '2026-11-26 22:43:24.914256+00');
+INSERT INTO acknowledgements VALUES ('replica-2', 'tictactoe', 1, '0000000000000000000000000000000000000000000000000000000000000000', 'it is loading', '{"champion": 1}', 1, 3, '2026-11-26 23:11:12.902782+00');
 INSERT INTO alembic_version VALUES ('0001');
-INSERT INTO alias_events VALUES (1, 'tictactoe', 'champion', 'set', 1, NULL, NULL, 'ada', 'the first', NULL, '2026-11-26 22:43:24.033274+00');
-INSERT INTO alias_events VALUES (2, 'tictactoe', 'champion', 'set', 2, 1, 1, 'league nightly', 'better', 'tictactoe-verdict-0123456789abcdef0123456789abcdef', '2026-11-26 22:43:24.517778+00');
-INSERT INTO alias_events VALUES (3, 'tictactoe', 'champion', 'rollback', 1, 2, NULL, 'ada', 'too slow', NULL, '2026-11-26 22:43:24.553021+00');
-INSERT INTO alias_events VALUES (4, 'tictactoe', 'candidate', 'set', 2, NULL, NULL, 'ada', 'again', NULL, '2026-11-26 22:43:24.568562+00');
+INSERT INTO alias_events VALUES (1, 'tictactoe', 'champion', 'set', 1, NULL, NULL, 'ada', 'the first', NULL, '2026-11-26 23:11:12.312714+00');
+INSERT INTO alias_events VALUES (2, 'tictactoe', 'champion', 'set', 2, 1, 1, 'league nightly', 'better', 'tictactoe-verdict-0123456789abcdef0123456789abcdef', '2026-11-26 23:11:12.587671+00');
+INSERT INTO alias_events VALUES (3, 'tictactoe', 'champion', 'rollback', 1, 2, NULL, 'ada', 'too slow', NULL, '2026-11-26 23:11:12.61523+00');
+INSERT INTO alias_events VALUES (4, 'tictactoe', 'candidate', 'set', 2, NULL, NULL, 'ada', 'again', NULL, '2026-11-26 23:11:12.624158+00');
 INSERT INTO aliases VALUES ('tictactoe', 'champion', 1, 3);
 INSERT INTO aliases VALUES ('tictactoe', 'candidate', 2, 4);
-INSERT INTO api_keys VALUES ('26ad9f51', 'ci', 'ce4f906557a614294bda0a05d96c7e91b30ecaeda38d4d10c0865417431899bf', '["read", "promote"]', '["tictactoe"]', 20, '2026-11-26 22:43:23.980542+00', NULL, NULL);
+INSERT INTO api_keys VALUES ('4f9b6777', 'ci', 'd8fe290630e3e5ec2c39de4f4fd361d1ce33ea4dbfd55635e9e5bc76bdcaabf7', '["promote", "read"]', '["tictactoe"]', 20, '2026-11-26 23:11:12.253661+00', NULL, NULL);
 INSERT INTO change_counter VALUES (1, 4, 1, 1, 1);
-INSERT INTO earlier_games VALUES ('tictactoe', '218f0e9a7309a1f13f6728e985622a170587fb68bd68cdb14cc04e3e106df647', '{"environment": "59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832", "environment.source": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855", "gymnasium": "1.2.2", "numpy": "2.4.6", "pettingzoo": "1.27.0", "play.opening_plies": 4, "play.scoring": null, "play.max_moves": 10000}', '2026-11-26 22:43:23.173287+00');
-INSERT INTO evaluations VALUES (1, 'tictactoe', '{"kind": "tournament", "blocks": 2}', 'done', '{"what": "games", "played": 1, "of": 4}', '{"matches": 4}', NULL, 'ci', '26ad9f51', 'why not', 2, 'runner', 0, '2026-11-26 22:43:24.66057+00', '2026-11-26 22:43:24.682203+00', '2026-11-26 22:43:24.722058+00', NULL, NULL, '2026-11-26 22:43:24.740505+00');
-INSERT INTO idempotent_calls VALUES ('26ad9f51', 'a', 'aaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaa', 1, NULL, NULL, '2026-11-26 22:43:24.009876+00');
-INSERT INTO idempotent_calls VALUES ('26ad9f51', 'b', 'bbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbb', NULL, 1, NULL, '2026-11-26 22:43:24.618371+00');
-INSERT INTO idempotent_calls VALUES ('26ad9f51', 'c', 'cccccccccccccccccccccccccccccccccccccccccccccccccccccccccccccccc', NULL, NULL, 1, '2026-11-26 22:43:24.652824+00');
-INSERT INTO leagues VALUES ('tictactoe', '{"league": "tictactoe", "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3", "api": null, "kwargs": {}, "wrappers": [], "vector": null, "revision": null}, "folder": null, "policies": null, "sides": null, "play": {"opening_plies": 0, "actions": null, "scoring": null, "num_envs": "auto", "max_moves": 10000, "game_seconds": 600.0, "action_names": null}, "training": {"seed": 0, "steps": null, "minutes": null, "checkpoint_every": "auto", "checkpoint_minutes": null, "runners": 1, "num_envs": "auto", "gamma": 0.99, "grad_clip": 0.5, "convolutions": [], "channels": null, "hidden": [256, 256], "normalize_observations": false, "policies_to_train": null, "opponents": {"fixed": [], "league": null}, "exploiter": {}, "strength": {"games": 200}, "gpus": 0.0, "runner_gpus": 0.0, "crashes": 3, "opening_plies": null, "algorithm": "ppo", "lr": 0.0005, "train_batch_size": 4096, "minibatch_size": 512, "epochs": 4, "lambda": 0.95, "clip": 0.2, "entropy": 0.05, "value_loss": 0.5, "magnet": null, "teacher": null, "recurrence": null, "shared_encoder": false, "per_policy": {}}, "gate": {"model": "normalized", "elo0": 0.0, "elo1": 30.0, "return0": 0.0, "return1": 0.0, "return_bound": null, "alpha": 0.05, "nights": 365, "beta": 0.05, "max_blocks": 4000, "anchors": [], "earlier_champions": 2, "margin": 50.0, "exploited_champions": 2, "exploiter_margin": null, "exploiters": {"count": 0, "budget": 0.15, "blocks": 200, "improvement": 0.0}, "confirmation_blocks": 200, "forfeits": false, "shadow_agreement": null, "latency_ms": null, "shadow_observations": 1000}, "nightly": {"minutes": null, "steps": null, "opponents": null, "exploiter": 0.15}, "sweep": null}', '{"agents": {"player_1": {"observation": {"type": "dict", "spaces": {"observation": {"type": "box", "dtype": "int8", "shape": [3, 3, 2], "low": 0, "high": 1}, "action_mask": {"type": "box", "dtype": "int8", "shape": [9], "low": 0, "high": 1}}}, "action": {"type": "discrete", "n": 9, "start": 0, "dtype": "int64"}}, "player_2": {"observation": {"type": "dict", "spaces": {"observation": {"type": "box", "dtype": "int8", "shape": [3, 3, 2], "low": 0, "high": 1}, "action_mask": {"type": "box", "dtype": "int8", "shape": [9], "low": 0, "high": 1}}}, "action": {"type": "discrete", "n": 9, "start": 0, "dtype": "int64"}}}, "policies": {"player_1": "shared", "player_2": "shared"}, "sides": {"player_1": ["player_1"], "player_2": ["player_2"]}, "hidden_information": false, "simultaneous": false}', '6d16b4a0bbbcd7092066a50ab35ee08620ba08fcf07f405918f7341d48ea7651', '59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832', '{"environment": "59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832", "environment.source": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855", "gymnasium": "1.2.2", "numpy": "2.4.6", "pettingzoo": "1.27.0", "play.opening_plies": 0, "play.scoring": null, "play.max_moves": 10000}', 'ea541f2a26bce9dc7714c7a045b8015b504235e736f7d4cdaf9a26ee382072db', 4, '2026-11-26 22:43:23.108607+00', NULL);
-INSERT INTO matches VALUES ('tictactoe-round_robin-1', 0, 'tictactoe', 'tictactoe@1', 'tictactoe@2', 2, '[1.5,0.5]', '[1.25,-0.75]', '[4469158401452630045,[0,1],[[[0,1],[3,0,0],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,0],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 22:43:24.397347+00');
-INSERT INTO matches VALUES ('tictactoe-round_robin-1', 1, 'tictactoe', 'tictactoe@1', 'script:random', 2, '[1.5,0.5]', '[1.25,-0.75]', '[453824526341104212,[1,1],[[[0,1],[3,0,1],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,1],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 22:43:24.397347+00');
-INSERT INTO matches VALUES ('tictactoe-round_robin-1', 2, 'tictactoe', 'tictactoe@2', 'script:random', 2, '[1.5,0.5]', '[1.25,-0.75]', '[8350938862647943808,[2,1],[[[0,1],[3,0,2],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,2],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 22:43:24.397347+00');
-INSERT INTO matches VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 0, 'tictactoe', 'tictactoe@2', 'tictactoe@1', 2, '[1.5,0.5]', '[1.25,-0.75]', '[4469158401452630045,[0,1],[[[0,1],[3,0,0],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,0],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 22:43:24.473021+00');
-INSERT INTO matches VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 1, 'tictactoe', 'tictactoe@2', 'tictactoe@1', 2, '[1.5,0.5]', '[1.25,-0.75]', '[453824526341104212,[1,1],[[[0,1],[3,0,1],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,1],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 22:43:24.473021+00');
-INSERT INTO matches VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 2, 'tictactoe', 'tictactoe@2', 'tictactoe@1', 2, '[1.5,0.5]', '[1.25,-0.75]', '[8350938862647943808,[2,1],[[[0,1],[3,0,2],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,2],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 22:43:24.473021+00');
-INSERT INTO nightly_runs VALUES (1, 'tictactoe', '[2]', 0.01, '{"champion": "tictactoe@2"}', '2026-11-26 22:43:24.482378+00', '2026-11-26 22:43:24.536951+00');
-INSERT INTO replicas VALUES ('replica-1', '{"process": "machine/1:2:3"}', 5, 4, 1, '2026-11-26 22:43:24.893821+00');
-INSERT INTO replicas VALUES ('replica-2', '{"process": "machine/1:3:3"}', 5, 3, 1, '2026-11-26 22:43:24.910216+00');
-INSERT INTO reports VALUES ('replica-1', '{"requests_total": []}', '2026-11-26 22:43:24.923644+00');
-INSERT INTO run_points VALUES ('tictactoe', 'run', 1000, '{"return": 0.25}', '2026-11-26 22:43:24.776223+00');
-INSERT INTO run_points VALUES ('tictactoe', 'run', 2000, '{"return": 0.5}', '2026-11-26 22:43:24.80175+00');
-INSERT INTO runs VALUES ('tictactoe', 'run', 'ppo', '{"lr": 0.0003}', 7, 2000, NULL, NULL, 'ended', NULL, 1, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:32533:242979', '{"git_commit": null}', 2000, 60, '{"return": 0.5}', 0, '2026-11-26 22:43:24.745872+00', '2026-11-26 22:43:24.813963+00', '2026-11-26 22:43:24.813963+00');
-INSERT INTO schedules VALUES (1, 'tictactoe-round_robin-1', 'tictactoe', 'round_robin', '{"id":"tictactoe-round_robin-1","league":"tictactoe","kind":"round_robin","seed":9223372036854775807,"environment_digest":"59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832","game_digest":"ea541f2a26bce9dc7714c7a045b8015b504235e736f7d4cdaf9a26ee382072db","sides":["player_1","player_2"],"contestants":["tictactoe@1","tictactoe@2","script:random"],"pairings":[[0,1],[0,2],[1,2]],"length":9,"opening_plies":2,"scoring":"game","actions":"greedy","common_seeds":false}', '2026-11-26 22:43:24.091091+00', NULL);
-INSERT INTO schedules VALUES (2, 'tictactoe-verdict-0123456789abcdef0123456789abcdef', 'tictactoe', 'verdict', '{"id":"tictactoe-verdict-0123456789abcdef0123456789abcdef","league":"tictactoe","kind":"verdict","seed":9223372036854775807,"environment_digest":"59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832","game_digest":"ea541f2a26bce9dc7714c7a045b8015b504235e736f7d4cdaf9a26ee382072db","sides":["player_1","player_2"],"contestants":["tictactoe@2","tictactoe@1"],"pairings":[[0,1]],"length":9,"opening_plies":2,"scoring":"game","actions":"greedy","common_seeds":false}', '2026-11-26 22:43:24.459329+00', NULL);
-INSERT INTO shadow_counts VALUES ('replica-1', 'tictactoe', 2, 1, 10, 20, 15, 1, 0, 2, '[1, 2, 3, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]', 5000, '2026-11-26 22:43:24.925905+00');
-INSERT INTO snapshots VALUES ('tictactoe', 'summary', '1; 3db8c2a09dcf; matches: 6; versions: 4; promotions: 3; verdicts, closed, void: 1 1 0', '{"matches": 6}', '2026-11-26 22:43:24.844426+00');
-INSERT INTO strengths VALUES ('tictactoe', 2, 'tictactoe@1', 'run', 2000, 100, 0.75, 0.6, 0.9, '2026-11-26 22:43:24.824611+00');
-INSERT INTO traffic_events VALUES (1, 'tictactoe', '2', 0.25, 'candidate', 0.5, 'ada', 'try it', '2026-11-26 22:43:24.639739+00');
-INSERT INTO training_nights VALUES (1, 'tictactoe', 1, '{"train": {"versions": ["tictactoe@2"], "start": 1}}', '2026-11-26 22:43:24.582514+00', '2026-11-26 22:43:24.607511+00');
-INSERT INTO verdicts VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 'tictactoe', 2, 'tictactoe@1', '{"gate": {"alpha": 0.01}, "night": 1, "anchors": [{"ref": "script:random", "margin": 0.1, "schedule": "tictactoe-round_robin-1", "mode": "no_worse"}], "exploiters": []}', 'promote', '{"promoted": true, "elo": 42.0}', '2026-11-26 22:43:24.492947+00', '2026-11-26 22:43:24.52594+00');
-INSERT INTO version_notes VALUES (1, 'tictactoe', 1, 'the first', 'ada', '2026-11-26 22:43:23.998683+00');
-INSERT INTO versions VALUES ('tictactoe', 1, 'ready', 'run/1000', NULL, 'main', NULL, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:32533:242979', '2026-11-26 22:43:23.328111+00', '{
+INSERT INTO earlier_games VALUES ('tictactoe', '218f0e9a7309a1f13f6728e985622a170587fb68bd68cdb14cc04e3e106df647', '{"environment": "59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832", "environment.source": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855", "gymnasium": "1.2.2", "numpy": "2.4.6", "pettingzoo": "1.27.0", "play.opening_plies": 4, "play.scoring": null, "play.max_moves": 10000}', '2026-11-26 23:11:11.822025+00');
+INSERT INTO evaluations VALUES (1, 'tictactoe', '{"kind": "tournament", "blocks": 2}', 'done', '{"what": "games", "played": 1, "of": 4}', '{"matches": 4}', NULL, 'ci', '4f9b6777', 'why not', 2, 'runner', 0, '2026-11-26 23:11:12.698469+00', '2026-11-26 23:11:12.706918+00', '2026-11-26 23:11:12.720404+00', NULL, NULL, '2026-11-26 23:11:12.738976+00');
+INSERT INTO idempotent_calls VALUES ('4f9b6777', 'a', 'aaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaa', 1, NULL, NULL, '2026-11-26 23:11:12.288135+00');
+INSERT INTO idempotent_calls VALUES ('4f9b6777', 'b', 'bbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbb', NULL, 1, NULL, '2026-11-26 23:11:12.659104+00');
+INSERT INTO idempotent_calls VALUES ('4f9b6777', 'c', 'cccccccccccccccccccccccccccccccccccccccccccccccccccccccccccccccc', NULL, NULL, 1, '2026-11-26 23:11:12.687683+00');
+INSERT INTO leagues VALUES ('tictactoe', '{"league": "tictactoe", "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3", "api": null, "kwargs": {}, "wrappers": [], "vector": null, "revision": null}, "folder": null, "policies": null, "sides": null, "play": {"opening_plies": 0, "actions": null, "scoring": null, "num_envs": "auto", "max_moves": 10000, "game_seconds": 600.0, "action_names": null}, "training": {"seed": 0, "steps": null, "minutes": null, "checkpoint_every": "auto", "checkpoint_minutes": null, "runners": 1, "num_envs": "auto", "gamma": 0.99, "grad_clip": 0.5, "convolutions": [], "channels": null, "hidden": [256, 256], "normalize_observations": false, "policies_to_train": null, "opponents": {"fixed": [], "league": null}, "exploiter": {}, "strength": {"games": 200}, "gpus": 0.0, "runner_gpus": 0.0, "crashes": 3, "opening_plies": null, "algorithm": "ppo", "lr": 0.0005, "train_batch_size": 4096, "minibatch_size": 512, "epochs": 4, "lambda": 0.95, "clip": 0.2, "entropy": 0.05, "value_loss": 0.5, "magnet": null, "teacher": null, "recurrence": null, "shared_encoder": false, "per_policy": {}}, "gate": {"model": "normalized", "elo0": 0.0, "elo1": 30.0, "return0": 0.0, "return1": 0.0, "return_bound": null, "alpha": 0.05, "nights": 365, "beta": 0.05, "max_blocks": 4000, "anchors": [], "earlier_champions": 2, "margin": 50.0, "exploited_champions": 2, "exploiter_margin": null, "exploiters": {"count": 0, "budget": 0.15, "blocks": 200, "improvement": 0.0}, "confirmation_blocks": 200, "forfeits": false, "shadow_agreement": null, "latency_ms": null, "shadow_observations": 1000}, "nightly": {"minutes": null, "steps": null, "opponents": null, "exploiter": 0.15}, "sweep": null}', '{"agents": {"player_1": {"observation": {"type": "dict", "spaces": {"observation": {"type": "box", "dtype": "int8", "shape": [3, 3, 2], "low": 0, "high": 1}, "action_mask": {"type": "box", "dtype": "int8", "shape": [9], "low": 0, "high": 1}}}, "action": {"type": "discrete", "n": 9, "start": 0, "dtype": "int64"}}, "player_2": {"observation": {"type": "dict", "spaces": {"observation": {"type": "box", "dtype": "int8", "shape": [3, 3, 2], "low": 0, "high": 1}, "action_mask": {"type": "box", "dtype": "int8", "shape": [9], "low": 0, "high": 1}}}, "action": {"type": "discrete", "n": 9, "start": 0, "dtype": "int64"}}}, "policies": {"player_1": "shared", "player_2": "shared"}, "sides": {"player_1": ["player_1"], "player_2": ["player_2"]}, "hidden_information": false, "simultaneous": false}', '6d16b4a0bbbcd7092066a50ab35ee08620ba08fcf07f405918f7341d48ea7651', '59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832', '{"environment": "59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832", "environment.source": "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855", "gymnasium": "1.2.2", "numpy": "2.4.6", "pettingzoo": "1.27.0", "play.opening_plies": 0, "play.scoring": null, "play.max_moves": 10000}', 'ea541f2a26bce9dc7714c7a045b8015b504235e736f7d4cdaf9a26ee382072db', 4, '2026-11-26 23:11:11.73953+00', NULL);
+INSERT INTO matches VALUES ('tictactoe-round_robin-1', 0, 'tictactoe', 'tictactoe@1', 'tictactoe@2', 2, '[1.5,0.5]', '[1.25,-0.75]', '[4469158401452630045,[0,1],[[[0,1],[3,0,0],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,0],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 23:11:12.519144+00');
+INSERT INTO matches VALUES ('tictactoe-round_robin-1', 1, 'tictactoe', 'tictactoe@1', 'script:random', 2, '[1.5,0.5]', '[1.25,-0.75]', '[453824526341104212,[1,1],[[[0,1],[3,0,1],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,1],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 23:11:12.519144+00');
+INSERT INTO matches VALUES ('tictactoe-round_robin-1', 2, 'tictactoe', 'tictactoe@2', 'script:random', 2, '[1.5,0.5]', '[1.25,-0.75]', '[8350938862647943808,[2,1],[[[0,1],[3,0,2],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,2],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 23:11:12.519144+00');
+INSERT INTO matches VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 0, 'tictactoe', 'tictactoe@2', 'tictactoe@1', 2, '[1.5,0.5]', '[1.25,-0.75]', '[4469158401452630045,[0,1],[[[0,1],[3,0,0],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,0],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 23:11:12.542656+00');
+INSERT INTO matches VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 1, 'tictactoe', 'tictactoe@2', 'tictactoe@1', 2, '[1.5,0.5]', '[1.25,-0.75]', '[453824526341104212,[1,1],[[[0,1],[3,0,1],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,1],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 23:11:12.542656+00');
+INSERT INTO matches VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 2, 'tictactoe', 'tictactoe@2', 'tictactoe@1', 2, '[1.5,0.5]', '[1.25,-0.75]', '[8350938862647943808,[2,1],[[[0,1],[3,0,2],[1.0,-1.0],[1.0,0.0]],[[1,0],[3,1,2],[0.25,0.25],[0.5,0.5]]]]', '2026-11-26 23:11:12.542656+00');
+INSERT INTO nightly_runs VALUES (1, 'tictactoe', '[2]', 0.01, '{"champion": "tictactoe@2"}', '2026-11-26 23:11:12.556847+00', '2026-11-26 23:11:12.60696+00');
+INSERT INTO replicas VALUES ('replica-1', '{"process": "machine/1:2:3"}', 5, 4, 1, '2026-11-26 23:11:12.883049+00');
+INSERT INTO replicas VALUES ('replica-2', '{"process": "machine/1:3:3"}', 5, 3, 1, '2026-11-26 23:11:12.901902+00');
+INSERT INTO reports VALUES ('replica-1', '{"requests_total": []}', '2026-11-26 23:11:12.909824+00');
+INSERT INTO run_points VALUES ('tictactoe', 'run', 1000, '{"return": 0.25}', '2026-11-26 23:11:12.765933+00');
+INSERT INTO run_points VALUES ('tictactoe', 'run', 2000, '{"return": 0.5}', '2026-11-26 23:11:12.793247+00');
+INSERT INTO runs VALUES ('tictactoe', 'run', 'ppo', '{"lr": 0.0003}', 7, 2000, NULL, NULL, 'ended', NULL, 1, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:25746:409933', '{"git_commit": null}', 2000, 60, '{"return": 0.5}', 0, '2026-11-26 23:11:12.743589+00', '2026-11-26 23:11:12.816612+00', '2026-11-26 23:11:12.816612+00');
+INSERT INTO schedules VALUES (1, 'tictactoe-round_robin-1', 'tictactoe', 'round_robin', '{"id":"tictactoe-round_robin-1","league":"tictactoe","kind":"round_robin","seed":9223372036854775807,"environment_digest":"59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832","game_digest":"ea541f2a26bce9dc7714c7a045b8015b504235e736f7d4cdaf9a26ee382072db","sides":["player_1","player_2"],"contestants":["tictactoe@1","tictactoe@2","script:random"],"pairings":[[0,1],[0,2],[1,2]],"length":9,"opening_plies":2,"scoring":"game","actions":"greedy","common_seeds":false}', '2026-11-26 23:11:12.332039+00', NULL);
+INSERT INTO schedules VALUES (2, 'tictactoe-verdict-0123456789abcdef0123456789abcdef', 'tictactoe', 'verdict', '{"id":"tictactoe-verdict-0123456789abcdef0123456789abcdef","league":"tictactoe","kind":"verdict","seed":9223372036854775807,"environment_digest":"59666bb9a018a69650bd0941cb5f08c962ff424b553a5e7419ff1603c78a6832","game_digest":"ea541f2a26bce9dc7714c7a045b8015b504235e736f7d4cdaf9a26ee382072db","sides":["player_1","player_2"],"contestants":["tictactoe@2","tictactoe@1"],"pairings":[[0,1]],"length":9,"opening_plies":2,"scoring":"game","actions":"greedy","common_seeds":false}', '2026-11-26 23:11:12.533137+00', NULL);
+INSERT INTO shadow_counts VALUES ('replica-1', 'tictactoe', 2, 1, 10, 20, 15, 1, 0, 2, '[1, 2, 3, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]', 5000, '2026-11-26 23:11:12.910992+00');
+INSERT INTO snapshots VALUES ('tictactoe', 'summary', '1; 3db8c2a09dcf; matches: 6; versions: 4; promotions: 3; verdicts, closed, void: 1 1 0', '{"matches": 6}', '2026-11-26 23:11:12.852341+00');
+INSERT INTO strengths VALUES ('tictactoe', 2, 'tictactoe@1', 'run', 2000, 100, 0.75, 0.6, 0.9, '2026-11-26 23:11:12.823557+00');
+INSERT INTO traffic_events VALUES (1, 'tictactoe', '2', 0.25, 'candidate', 0.5, 'ada', 'try it', '2026-11-26 23:11:12.68+00');
+INSERT INTO training_nights VALUES (1, 1, 'tictactoe', 1, '{"train": {"versions": ["tictactoe@2"], "start": 1}}', '2026-11-26 23:11:12.633051+00', '2026-11-26 23:11:12.655453+00');
+INSERT INTO verdicts VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 'tictactoe', 2, 'tictactoe@1', '{"gate": {"alpha": 0.01}, "night": 1, "anchors": [{"ref": "script:random", "margin": 0.1, "schedule": "tictactoe-round_robin-1", "mode": "no_worse"}], "exploiters": []}', 'promote', '{"promoted": true, "elo": 42.0}', '2026-11-26 23:11:12.56627+00', '2026-11-26 23:11:12.597234+00');
+INSERT INTO version_notes VALUES (1, 'tictactoe', 1, 'the first', 'ada', '2026-11-26 23:11:12.275899+00');
+INSERT INTO versions VALUES ('tictactoe', 1, 'ready', 'run/1000', NULL, 'main', NULL, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:25746:409933', '2026-11-26 23:11:11.865805+00', '{
   "league": "tictactoe",
   "version": 1,
-  "created_at": "2026-11-26T22:43:23.635490Z",
+  "created_at": "2026-11-26T23:11:11.894018Z",
   "interface": {
     "agents": {
       "player_1": {
@@ -554,11 +555,11 @@ INSERT INTO versions VALUES ('tictactoe', 1, 'ready', 'run/1000', NULL, 'main', 
     "training/state.bin": "40aff2e9d2d8922e47afd4648e6967497158785fbd1da870e7110266bf944880"
   }
 }
-', 'e290b2b4beb39567ee0c4da2982d3d4f7729b9598040366727978f4ab2817dfb', NULL);
-INSERT INTO versions VALUES ('tictactoe', 2, 'ready', 'run/2000', 1, 'main', NULL, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:32533:242979', '2026-11-26 22:43:23.813168+00', '{
+', '3ebc62ccda222f4dbeac113a97cd0b8aee4c3d04000f055234d6381b75006990', NULL);
+INSERT INTO versions VALUES ('tictactoe', 2, 'ready', 'run/2000', 1, 'main', NULL, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:25746:409933', '2026-11-26 23:11:11.98083+00', '{
   "league": "tictactoe",
   "version": 2,
-  "created_at": "2026-11-26T22:43:23.828786Z",
+  "created_at": "2026-11-26T23:11:12.006840Z",
   "interface": {
     "agents": {
       "player_1": {
@@ -753,11 +754,11 @@ INSERT INTO versions VALUES ('tictactoe', 2, 'ready', 'run/2000', 1, 'main', NUL
     "training/state.bin": "40aff2e9d2d8922e47afd4648e6967497158785fbd1da870e7110266bf944880"
   }
 }
-', 'ce2ec60da287e45e9634f555f807459672a9f036678c071c04d37b285f9e60eb', NULL);
-INSERT INTO versions VALUES ('tictactoe', 3, 'ready', 'exploiter/500', NULL, 'exploiter', 'tictactoe@1', 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:32533:242979', '2026-11-26 22:43:23.903247+00', '{
+', 'a5a453c90b4c473888ffdfdd2eaf4c04e18c87d594558c4b97681861b974b167', NULL);
+INSERT INTO versions VALUES ('tictactoe', 3, 'ready', 'exploiter/500', NULL, 'exploiter', 'tictactoe@1', 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:25746:409933', '2026-11-26 23:11:12.066709+00', '{
   "league": "tictactoe",
   "version": 3,
-  "created_at": "2026-11-26T22:43:23.907932Z",
+  "created_at": "2026-11-26T23:11:12.070924Z",
   "interface": {
     "agents": {
       "player_1": {
@@ -952,11 +953,11 @@ INSERT INTO versions VALUES ('tictactoe', 3, 'ready', 'exploiter/500', NULL, 'ex
     "training/state.bin": "40aff2e9d2d8922e47afd4648e6967497158785fbd1da870e7110266bf944880"
   }
 }
-', '201adad9cbd7367eb88dfe0eac7a73addb557a5d9c50c76edfaf631187334716', NULL);
-INSERT INTO versions VALUES ('tictactoe', 4, 'ready', 'mixture/1:0.25,2:0.75', NULL, 'mixture', NULL, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:32533:242979', '2026-11-26 22:43:23.958439+00', '{
+', '42e5026b92a698c8bbc25341e93e57047cbe57b7ddefc85252c336c06e76d282', NULL);
+INSERT INTO versions VALUES ('tictactoe', 4, 'ready', 'mixture/1:0.25,2:0.75', NULL, 'mixture', NULL, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:25746:409933', '2026-11-26 23:11:12.197207+00', '{
   "league": "tictactoe",
   "version": 4,
-  "created_at": "2026-11-26T22:43:23.963626Z",
+  "created_at": "2026-11-26T23:11:12.201885Z",
   "interface": {
     "agents": {
       "player_1": {
@@ -1063,12 +1064,12 @@ INSERT INTO versions VALUES ('tictactoe', 4, 'ready', 'mixture/1:0.25,2:0.75', N
       {
         "version": 1,
         "probability": 0.25,
-        "sha256": "e290b2b4beb39567ee0c4da2982d3d4f7729b9598040366727978f4ab2817dfb"
+        "sha256": "3ebc62ccda222f4dbeac113a97cd0b8aee4c3d04000f055234d6381b75006990"
       },
       {
         "version": 2,
         "probability": 0.75,
-        "sha256": "ce2ec60da287e45e9634f555f807459672a9f036678c071c04d37b285f9e60eb"
+        "sha256": "a5a453c90b4c473888ffdfdd2eaf4c04e18c87d594558c4b97681861b974b167"
       }
     ]
   },
@@ -1076,7 +1077,7 @@ INSERT INTO versions VALUES ('tictactoe', 4, 'ready', 'mixture/1:0.25,2:0.75', N
   "stack": {},
   "files": {}
 }
-', 'f6d40b84de9daae1ba971ef2188467394b362be40470126ef7608d379c9e6159', NULL);
+', '4e4f4291e07691d519b7e3c4413d4480fe101a2be6f02b60e4facbeff866e564', NULL);
 SELECT pg_catalog.setval('alias_events_id_seq', 5, false);
 SELECT pg_catalog.setval('evaluations_id_seq', 2, false);
 SELECT pg_catalog.setval('nightly_runs_id_seq', 2, false);

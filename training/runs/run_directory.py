@@ -38,8 +38,8 @@ from league.refs import CheckpointRef, RemoteRef, of_league, parse_ref
 from league.registry.processes import host_name, is_local
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, Role
-from league.registry.storage.rows import StoredRun
-from league.registry.training.runs import HEARTBEAT_TIMEOUT, RUNNING
+from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunRow
+from league.registry.training.runs import RUNNING
 from league.settings import Storage
 
 
@@ -312,7 +312,7 @@ def _records(registry: Registry, league: str, run: str | None = None) -> dict[Pa
     records = {file.parent: _record(file.read_text(), str(file)) for file in runs.glob(f"*/{RUN_FILE}")}
     for stored in registry.runs.stored(league, run):
         if runs / stored.id not in records or not is_local(stored.driver):
-            record = stored.record | {"complete": stored.state == "ended"}
+            record = (stored.record or {}) | {"complete": stored.state == "ended"}
             records[runs / stored.id] = _record(record, f"run {stored.id} in the registry")
     return records
 
@@ -331,7 +331,7 @@ def _wait_for_other_machine(registry: Registry, league: str, run: str) -> None:
 
     Raises AlreadyRunning if it sends another heartbeat.
     """
-    previous_run: StoredRun | None = None
+    previous_run: RunRow | None = None
     while stored := registry.runs.stored(league, run):
         (current_run,) = stored
         if current_run.state != RUNNING or is_local(current_run.driver):

@@ -50,7 +50,7 @@ def is_metric(name: str, value: Any) -> bool:
 
 logger = logging.getLogger("policy_league")
 HEARTBEAT_SECONDS = 5.0
-"""Maximum interval between heartbeats, in seconds: far less than `league.registry.training.runs.HEARTBEAT_TIMEOUT`."""
+"""Maximum interval between heartbeats, in seconds: far less than `league.registry.storage.rows.HEARTBEAT_TIMEOUT`."""
 FINAL_REPORT_SECONDS = 10.0
 """How long an ending driver waits for the registry, in seconds."""
 RETRY_SECONDS = 0.5
@@ -111,7 +111,8 @@ class RunReporter:
         with self._lock:
             if self._newest is not None and self._newest is not self._reported:
                 curves = self._newest.curves | curves
-            self._newest = RunPoint(int(metrics["steps"]), curves, datetime.now(UTC))
+            league, steps = self._run.record.config.league, int(metrics["steps"])
+            self._newest = RunPoint(league, self._run.id, steps, curves, datetime.now(UTC))
             self._seconds = float(metrics["seconds"])
         self._has_news.set()
 

@@ -82,7 +82,7 @@ class StrengthQueue:
                 if not self._is_closed:
                     assert self._measure is not None
                     rows = self._measure(version, games=self._games)
-                    self._registry.strength.record(self._league, self._run.id, rows)
+                    self._registry.strength.record(rows)
                     # The names of TensorBoard's files contain the time in seconds only.
                     directory, suffix = self._run.path / STRENGTH, f".{version.number}"
                     with SummaryWriter(str(directory), filename_suffix=suffix) as writer:

@@ -9,7 +9,7 @@ what an interrupted removal of a league leaves.
 
 import json
 import shutil
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -27,25 +27,26 @@ from league.registry.publishing import VersionPublisher
 from league.registry.storage import change_counter
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
-from league.registry.storage.rows import VerdictRow, detached
+from league.registry.storage.rows import (
+    AliasEvent,
+    EvaluationRow,
+    LeagueRow,
+    NightlyRunRow,
+    RunRow,
+    SnapshotRow,
+    StrengthRow,
+    VerdictRow,
+)
 from league.registry.storage.tables import (
     ABANDONED,
     READY,
-    AliasEventTable,
     AliasTable,
     Base,
-    EvaluationTable,
     IdempotentCallTable,
-    LeagueTable,
     MatchTable,
-    NightlyRunTable,
-    RunTable,
     ScheduleTable,
     ShadowCountTable,
-    SnapshotTable,
-    StrengthTable,
     TrafficEventTable,
-    VerdictTable,
     VersionNoteTable,
     VersionTable,
 )
@@ -125,8 +126,8 @@ class RemovalRepository(Repository):
             )
             sizes = {number: self._artifacts.size(league, number) for number in numbers}
             aliases = _names(session, AliasTable.name, league)
-            verdicts = _names(session, VerdictTable.id, league)
-            run_ids = _names(session, RunTable.id, league)
+            verdicts = _names(session, VerdictRow.id, league)
+            run_ids = _names(session, RunRow.id, league)
             matches = _count_matches(session, MatchTable.league == league)
         reasons = [
             *(f"the alias {name} is set" for name in aliases),
@@ -155,7 +156,9 @@ class RemovalRepository(Repository):
             leagues.lock(session, target.league)
             versions.require(session, target.league, target.version)
             _require_idle(session, target.league)
-            _require_no_member(session, target.league, target.version)
+            if mixtures := _mixtures_of(session, target.league, target.version):
+                names = ", ".join(f"{target.league}@{mixture}" for mixture in mixtures)
+                raise Conflict(f"{plan.target} is a member of {names}: remove the mixture first")
             dependents = _dependents_of_version(session, target.league, target.version)
             _require_free(plan.target, dependents.reasons, force)
             _delete_dependents(session, target.league, target.version, dependents, actor)
@@ -180,7 +183,13 @@ class RemovalRepository(Repository):
             row.archived_at = row.archived_at or datetime.now(UTC)
             for subject in ("aliases", "traffic", "leagues"):
                 change_counter.count(session, subject)
-            _delete_calls(session, league)
+            call = IdempotentCallTable
+            for column, result in (
+                (call.event, AliasEvent),
+                (call.traffic, TrafficEventTable),
+                (call.evaluation, EvaluationRow),
+            ):
+                session.execute(delete(call).where(column.in_(select(result.id).filter_by(league=league))))
             for table in reversed(Base.metadata.sorted_tables):
                 if "league" in table.columns and table.name != VersionTable.__tablename__:
                     session.execute(delete(table).where(table.c.league == league))
@@ -196,7 +205,7 @@ class RemovalRepository(Repository):
             report.unlink(missing_ok=True)
         with self._database.write() as session:
             session.execute(delete(VersionTable).filter_by(league=league, state=ABANDONED))
-            session.execute(delete(LeagueTable).filter_by(slug=league))
+            session.execute(delete(LeagueRow).filter_by(slug=league))
         return plan
 
 
@@ -206,8 +215,7 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     dependents.aliases += session.scalars(
         select(AliasTable.name).filter_by(league=league, version=number).order_by(AliasTable.name)
     )
-    for row in session.scalars(select(VerdictTable).filter_by(league=league).order_by(VerdictTable.opened_at)):
-        verdict = detached(VerdictRow, row)
+    for verdict in session.scalars(select(VerdictRow).filter_by(league=league).order_by(VerdictRow.opened_at)):
         if ref in verdict.contestants:
             dependents.verdicts.append(verdict.id)
             dependents.schedules |= set(verdict.schedules)
@@ -217,9 +225,9 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     matches = _count_matches(session, _matches_of(ref, dependents))
     children = session.scalars(_ready(league).filter_by(parent=number)).all()
     exploiters = session.scalars(_ready(league).filter_by(exploits=ref)).all()
-    uses = or_(RunTable.parent == number, RunTable.exploits == ref)
-    started = session.scalars(select(RunTable.id).filter_by(league=league).where(uses).order_by(RunTable.id)).all()
-    nights = session.scalars(select(NightlyRunTable).filter_by(league=league, ended_at=None)).all()
+    uses = or_(RunRow.parent == number, RunRow.exploits == ref)
+    started = session.scalars(select(RunRow.id).filter_by(league=league).where(uses).order_by(RunRow.id)).all()
+    nights = session.scalars(select(NightlyRunRow).filter_by(league=league, ended_at=None)).all()
     setting = traffic.current_setting(session, league)
     portions = {"canary": setting.canary, "shadow": setting.shadow}
     names = {number, *dependents.aliases}
@@ -245,26 +253,31 @@ def _delete_dependents(session: Session, league: str, number: int, found: _Depen
     if found.portions:
         change_counter.count(session, "traffic")
         traffic.end(session, league, found.portions, actor=actor, reason=f"{league}@{number} was removed")
-    gone = set(session.scalars(select(AliasEventTable.id).filter_by(league=league, version=number)))
+    gone = set(session.scalars(select(AliasEvent.id).filter_by(league=league, version=number)))
     session.execute(delete(IdempotentCallTable).where(IdempotentCallTable.event.in_(gone)))
     session.execute(delete(AliasTable).filter_by(league=league, version=number))
-    _relink(session, league, gone)
-    session.execute(delete(AliasEventTable).where(AliasEventTable.id.in_(gone)))
-    session.execute(update(AliasEventTable).where(AliasEventTable.verdict.in_(found.verdicts)).values(verdict=None))
-    session.execute(delete(VerdictTable).where(VerdictTable.id.in_(found.verdicts)))
+    events = {event.id: event for event in session.scalars(select(AliasEvent).filter_by(league=league))}
+    for event in events.values():  # a rollback returns to the event beneath those that are deleted
+        while event.beneath is not None and event.beneath in gone:
+            event.beneath = events[event.beneath].beneath
+    session.flush()
+    session.execute(delete(AliasEvent).where(AliasEvent.id.in_(gone)))
+    session.execute(update(AliasEvent).where(AliasEvent.verdict.in_(found.verdicts)).values(verdict=None))
+    session.execute(delete(VerdictRow).where(VerdictRow.id.in_(found.verdicts)))
     session.execute(delete(MatchTable).where(_matches_of(f"{league}@{number}", found)))
     session.execute(delete(ScheduleTable).where(ScheduleTable.id.in_(found.schedules)))
-    session.execute(delete(ScheduleTable).where(ScheduleTable.id.in_(found.played), ~_has_matches()))
-    session.execute(delete(SnapshotTable).filter_by(league=league))
+    has_matches = exists().where(MatchTable.schedule == ScheduleTable.id)
+    session.execute(delete(ScheduleTable).where(ScheduleTable.id.in_(found.played), ~has_matches))
+    session.execute(delete(SnapshotRow).filter_by(league=league))
     session.execute(delete(VersionNoteTable).filter_by(league=league, version=number))
-    strength, ref = StrengthTable, f"{league}@{number}"
+    strength, ref = StrengthRow, f"{league}@{number}"
     measured = or_(strength.version == number, strength.opponent == ref)
     session.execute(delete(strength).where(strength.league == league, measured))
     counts = ShadowCountTable
     of_version = or_(counts.candidate == number, counts.champion == number)
     session.execute(delete(counts).where(counts.league == league, of_version))
     session.execute(update(VersionTable).filter_by(league=league, parent=number).values(parent=None))
-    session.execute(update(RunTable).filter_by(league=league, parent=number).values(parent=None))
+    session.execute(update(RunRow).filter_by(league=league, parent=number).values(parent=None))
     session.execute(update(VersionTable).filter_by(league=league, number=number).values(state=ABANDONED))
 
 
@@ -274,47 +287,13 @@ def _matches_of(ref: str, found: _Dependents) -> ColumnElement[bool]:
     return or_(MatchTable.schedule.in_(found.schedules), and_(MatchTable.schedule.in_(found.played), takes_part))
 
 
-def _has_matches() -> ColumnElement[bool]:
-    return exists().where(MatchTable.schedule == ScheduleTable.id)
-
-
-def _relink(session: Session, league: str, gone: Collection[int]) -> None:
-    """Let a rollback return to the event beneath those that are deleted."""
-    events = {event.id: event for event in session.scalars(select(AliasEventTable).filter_by(league=league))}
-    for event in events.values():
-        while event.beneath is not None and event.beneath in gone:
-            event.beneath = events[event.beneath].beneath
-    session.flush()
-
-
-def _delete_calls(session: Session, league: str) -> None:
-    """Delete the idempotency keys whose results are deleted with a league."""
-    call = IdempotentCallTable
-    for column, table in (
-        (call.event, AliasEventTable),
-        (call.traffic, TrafficEventTable),
-        (call.evaluation, EvaluationTable),
-    ):
-        session.execute(delete(call).where(column.in_(select(table.id).filter_by(league=league))))
-
-
 def _require_idle(session: Session, league: str) -> None:
     """Raise Conflict while the league is trained or evaluated."""
-    current_time = datetime.now(UTC)
     for run in runs.active(session, league):
-        if current_time - run.heartbeat_at < runs.HEARTBEAT_TIMEOUT:
+        if run.state == runs.RUNNING:
             raise Conflict(f"training run {run.id} of league {league} is active: stop it first, or wait for its end")
     for evaluation in evaluations.active(session, league):
         raise Conflict(f"evaluation {evaluation.id} of league {league} is {evaluation.state}: stop it, or wait")
-
-
-def _require_no_member(session: Session, league: str, number: int) -> None:
-    """Raise Conflict if the version is a member of a mixture, which could not play without it."""
-    if containing := _mixtures_of(session, league, number):
-        raise Conflict(
-            f"{league}@{number} is a member of {', '.join(f'{league}@{mixture}' for mixture in containing)}:"
-            " remove the mixture first"
-        )
 
 
 def _mixtures_of(session: Session, league: str, number: int) -> list[int]:

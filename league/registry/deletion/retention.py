@@ -24,15 +24,8 @@ from league.registry.storage import change_counter
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
 from league.registry.storage.manifest import MIXTURE
-from league.registry.storage.tables import (
-    READY,
-    AliasEventTable,
-    AliasTable,
-    NightlyRunTable,
-    ScheduleTable,
-    VerdictTable,
-    VersionTable,
-)
+from league.registry.storage.rows import AliasEvent, NightlyRunRow, VerdictRow
+from league.registry.storage.tables import READY, AliasTable, ScheduleTable, VersionTable
 from league.registry.training import runs
 from league.registry.verdicts import VOID
 
@@ -124,17 +117,17 @@ def _candidates(session: Session, league: str, keep: int, before: datetime) -> t
 
 def _needed(session: Session, league: str) -> set[int]:
     """Return the versions that an alias pointed to, or that traffic, a verdict or a recorded game refers to."""
-    needed = set(session.scalars(select(AliasEventTable.version).filter_by(league=league)))
+    needed = set(session.scalars(select(AliasEvent.version).filter_by(league=league)))
     setting = traffic.current_setting(session, league)
     needed |= {
         portion.version for portion in (setting.canary, setting.shadow) if portion and isinstance(portion.version, int)
     }
-    verdicts = select(VerdictTable).where(VerdictTable.league == league, VerdictTable.outcome.is_distinct_from(VOID))
+    verdicts = select(VerdictRow).where(VerdictRow.league == league, VerdictRow.outcome.is_distinct_from(VOID))
     refs: set[str] = set()
     for verdict in session.scalars(verdicts):
         needed.add(verdict.candidate)
         refs.add(verdict.champion)
-    for candidates in session.scalars(select(NightlyRunTable.candidates).filter_by(league=league, ended_at=None)):
+    for candidates in session.scalars(select(NightlyRunRow.candidates).filter_by(league=league, ended_at=None)):
         needed |= set(candidates)
     counted = select(ScheduleTable).filter_by(league=league, purged_at=None)
     for schedule in session.scalars(counted):

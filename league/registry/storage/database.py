@@ -6,7 +6,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from functools import wraps
@@ -92,18 +92,11 @@ def _exclusive(engine: Engine) -> Iterator[Connection]:
         return
     lock = Path(f"{engine.url.database}.lock")
     with disk_errors(lock), FileLock(lock, timeout=LOCK_SECONDS):
-        _enable_wal(engine)
+        # The mode is stored in the file. SQLite does not change it inside a transaction, hence the raw connection.
+        with closing(engine.raw_connection()) as raw:
+            raw.cursor().execute("PRAGMA journal_mode = WAL")
         with writing.begin() as connection:
             yield connection
-
-
-def _enable_wal(engine: Engine) -> None:
-    # The mode is stored in the file. SQLite does not change it inside a transaction, hence the raw connection.
-    connection = engine.raw_connection()
-    try:
-        connection.cursor().execute("PRAGMA journal_mode = WAL")
-    finally:
-        connection.close()
 
 
 def _apply(connection: Connection) -> None:
@@ -157,7 +150,9 @@ class Database:
         """
         self.engine = _engine(url, create, listens)
         self.listener = Listener(self.engine) if listens else None
-        self._reading = _autocommit(self.engine)
+        # Each statement of PostgreSQL has a snapshot of its own also in a transaction, so that one would only add
+        # statements; SQLite has a snapshot per transaction.
+        self._reading = self.engine if self.is_sqlite else self.engine.execution_options(isolation_level="AUTOCOMMIT")
         self._writing = self.engine.execution_options(writes=True)
         self._checkouts = _Checkouts(self.engine)
         self._of_thread = threading.local()
@@ -234,13 +229,6 @@ class Database:
     def close(self) -> None:
         """Close the connections."""
         self.engine.dispose()
-
-
-def _autocommit(engine: Engine) -> Engine:
-    """The engine for reads. Each statement of PostgreSQL has a snapshot of its own also in a transaction, so that one
-    would only add statements; SQLite has a snapshot per transaction.
-    """
-    return engine.execution_options(isolation_level="AUTOCOMMIT") if engine.dialect.name == "postgresql" else engine
 
 
 class _Checkouts:

@@ -1,9 +1,16 @@
-"""Immutable records that the registry returns, detached from database sessions."""
+"""Immutable records that the registry returns, detached from database sessions.
+
+A record that is one row is the class of its table.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from datetime import datetime, timedelta
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from dataclasses import FrozenInstanceError, dataclass, field
+from datetime import UTC, datetime, timedelta
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index, String, Text, inspect
+from sqlalchemy.orm import Mapped, MappedAsDataclass, mapped_column
 
 from league.conditions import Conditions, action_selection
 from league.errors import LeagueArchived
@@ -12,48 +19,62 @@ from league.interface import Interface
 from league.refs import short_verdict
 from league.registry.storage.manifest import EXPLOITER, MAIN, Manifest, Role
 from league.registry.storage.mixture import Mixture
+from league.registry.storage.tables import Base
 from league.verdict_tests import CompanionTests
 
 if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
     from league.config.league import LeagueConfig
 
-Record = TypeVar("Record", bound="DataclassInstance")
+
+class Record(MappedAsDataclass, Base):
+    """A row of a table. It can be changed in the transaction that has read or created it, and not afterwards."""
+
+    __abstract__ = True
+
+    def __setattr__(self, name: str, value: object) -> None:
+        state = inspect(self, raiseerr=False)
+        if state is not None and state.detached:
+            raise FrozenInstanceError(f"{name} of {type(self).__name__} cannot be set: its transaction has ended")
+        super().__setattr__(name, value)
 
 
-def detached(kind: type[Record], row: object, **converted: Any) -> Record:
-    """Return the record of a table's row. converted: fields that differ from the column of the same name."""
-    same = (field.name for field in fields(kind) if field.name not in converted)
-    return kind(**{name: getattr(row, name) for name in same}, **converted)
+class LeagueRow(Record, kw_only=True):
+    """A registered league. Its row is the lock for all changes to the league."""
 
+    __tablename__ = "leagues"
 
-def require_active(league: str, archived_at: datetime | None) -> None:
-    """Raise LeagueArchived if a league is archived."""
-    if archived_at is not None:
-        raise LeagueArchived(f"league {league} is archived: `league archive {league} --undo` makes it active again")
-
-
-@dataclass(frozen=True, slots=True)
-class LeagueRow:
-    """A registered league."""
-
-    slug: str
-    config: "LeagueConfig"
-    interface: Interface
-    interface_digest: str
-    environment_digest: str
-    game: dict[str, Any]
+    slug: Mapped[str] = mapped_column(String(255), primary_key=True)
+    config_document: Mapped[dict[str, Any]] = mapped_column("config")
+    interface_document: Mapped[dict[str, Any]] = mapped_column("interface")
+    interface_digest: Mapped[str] = mapped_column(String(64))
+    environment_digest: Mapped[str] = mapped_column(String(64))
+    game: Mapped[dict[str, Any]]
     """What decides results, see `LeagueConfig.game`."""
-    game_digest: str
+    game_digest: Mapped[str] = mapped_column(String(64))
     """SHA-256 of `game`. Only results with the same digest are combined."""
-    registered_at: datetime
-    archived_at: datetime | None
+    last_version: Mapped[int]
+    """The highest number ever reserved. Numbers are never reused."""
+    registered_at: Mapped[datetime]
+    archived_at: Mapped[datetime | None]
     """Since when nothing is trained, published or tested."""
+
+    @cached_property
+    def config(self) -> "LeagueConfig":
+        """Raises ConfigError if it is one of another release."""
+        from league.config.league import LeagueConfig  # Takes 0.05 s to import, and most commands read versions only.
+
+        return LeagueConfig.from_mapping(self.config_document, source=f"the registered league {self.slug}")
+
+    @cached_property
+    def interface(self) -> Interface:
+        return Interface.model_validate(self.interface_document)
 
     def require_active(self) -> None:
         """Raise LeagueArchived if the league is archived."""
-        require_active(self.slug, self.archived_at)
+        if self.archived_at is not None:
+            raise LeagueArchived(
+                f"league {self.slug} is archived: `league archive {self.slug} --undo` makes it active again"
+            )
 
     @property
     def conditions(self) -> Conditions:
@@ -61,14 +82,17 @@ class LeagueRow:
         return Conditions(self.game_digest, action_selection(self.config, self.interface))
 
 
-@dataclass(frozen=True, slots=True)
-class EarlierGameRow:
-    """A game that a league had before its environment's code or its rules changed."""
+class EarlierGameRow(Record, kw_only=True):
+    """A game that a league had before its environment's code or its rules changed. Its results are kept apart."""
 
-    digest: str
-    game: dict[str, Any]
+    __tablename__ = "earlier_games"
+
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
+    digest: Mapped[str] = mapped_column(String(64), primary_key=True)
+    game: Mapped[dict[str, Any]]
     """See `LeagueConfig.game`."""
-    replaced_at: datetime
+    replaced_at: Mapped[datetime]
+    """When the league had this game last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,43 +156,28 @@ class VersionRow:
         return self.manifest.created_at
 
 
-@dataclass(frozen=True, slots=True)
-class AliasEvent:
-    """A change of an alias."""
+class AliasEvent(Record, kw_only=True):
+    """A change of an alias with actor, reason and verdict. Never changed."""
 
-    id: int
-    league: str
-    alias: str
-    kind: Literal["set", "rollback"]
-    version: int
-    previous: int | None
+    __tablename__ = "alias_events"
+    __table_args__ = (
+        ForeignKeyConstraint(["league", "version"], ["versions.league", "versions.number"]),
+        Index("ix_alias_events_league_alias_id", "league", "alias", "id"),
+    )
+
+    id: Mapped[int] = mapped_column(primary_key=True, default=None)
+    league: Mapped[str] = mapped_column(String(255))
+    alias: Mapped[str] = mapped_column(String(255))
+    kind: Mapped[Literal["set", "rollback"]] = mapped_column(String(16))
+    version: Mapped[int]
+    previous: Mapped[int | None]
     """The version that it pointed to before the change."""
-    actor: str
-    reason: str
-    verdict: str | None
-    at: datetime
-
-
-@dataclass(frozen=True, slots=True)
-class Acknowledgement:
-    """What a replica serves of a league. `version` is None while it serves nothing."""
-
-    replica: str
-    league: str
-    version: int | None
-    sha256: str | None
-    fault: str | None
-    """Why it does not serve what it should, if so."""
-    aliases: dict[str, int]
-    """alias → version that it serves"""
-    event: int | None
-    """Id of the newest alias event of the league that it has read; None if it has not reported on the league."""
-    traffic: int | None
-    """Id of the traffic setting that it follows completely."""
-    seen_at: datetime
-    """Time of its last report, by the clock of the database."""
-    silence: timedelta
-    """Time since its last report, by the clock of the database."""
+    beneath: Mapped[int | None] = mapped_column(ForeignKey("alias_events.id"))
+    """The event that a rollback of this one returns to."""
+    actor: Mapped[str] = mapped_column(Text)
+    reason: Mapped[str] = mapped_column(Text)
+    verdict: Mapped[str | None] = mapped_column(ForeignKey("verdicts.id"))
+    at: Mapped[datetime]
 
 
 class ChangeCounts(NamedTuple):
@@ -200,14 +209,30 @@ class ReadPosition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ServedState:
-    """What a replica serves of a league. The fields are those of Acknowledgement."""
+    """What a replica serves of a league. `version` is None while it serves nothing."""
 
     version: int | None = None
     sha256: str | None = None
     fault: str | None = None
+    """Why it does not serve what it should, if so."""
     aliases: Mapping[str, int] = field(default_factory=dict)
+    """alias → version that it serves"""
     event: int | None = None
+    """Id of the newest alias event of the league that it has read; None if it has not reported on the league."""
     traffic: int | None = None
+    """Id of the traffic setting that it follows completely."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acknowledgement(ServedState):
+    """What a replica has reported that it serves of a league."""
+
+    replica: str
+    league: str
+    seen_at: datetime
+    """Time of its last report, by the clock of the database."""
+    silence: timedelta
+    """Time since its last report, by the clock of the database."""
 
 
 class VersionState(NamedTuple):
@@ -295,43 +320,46 @@ class ShadowCounts:
         return Histogram(self.latency).quantile(share)
 
 
-@dataclass(frozen=True, slots=True)
-class KeyRow:
-    """An API key without its text, which is not stored."""
+class KeyRow(Record, kw_only=True):
+    """An API key without its text, which is not stored. Rows are never deleted: `revoked_at` ends a key."""
 
-    id: str
-    name: str
-    sha256: str
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(String(8), primary_key=True)
+    name: Mapped[str] = mapped_column(String(255), unique=True)
+    sha256: Mapped[str] = mapped_column(String(64), unique=True)
     """Digest of the key's text."""
-    scopes: frozenset[str]
-    leagues: frozenset[str] | None
+    scopes: Mapped[frozenset[str]]
+    leagues: Mapped[frozenset[str] | None]
     """Leagues that it is valid for; None: all."""
-    rate: float | None
+    rate: Mapped[float | None]
     """Requests per second at each replica; None: unlimited."""
-    created_at: datetime
-    expires_at: datetime | None
-    revoked_at: datetime | None
+    created_at: Mapped[datetime]
+    expires_at: Mapped[datetime | None]
+    revoked_at: Mapped[datetime | None]
 
     def is_valid(self, now: datetime) -> bool:
         """Return whether the key is neither revoked nor expired."""
         return self.revoked_at is None and (self.expires_at is None or now < self.expires_at)
 
 
-@dataclass(frozen=True, slots=True)
-class VerdictRow:
+class VerdictRow(Record, kw_only=True):
     """The decision of a gate on `candidate` against `champion`; outcome and evidence are None while it is open."""
 
-    id: str
+    __tablename__ = "verdicts"
+    __table_args__ = (ForeignKeyConstraint(["league", "candidate"], ["versions.league", "versions.number"]),)
+
+    id: Mapped[str] = mapped_column(String(255), primary_key=True)
     """Id of the schedule whose matches it counts."""
-    league: str
-    candidate: int
-    champion: str
+    league: Mapped[str] = mapped_column(String(255), index=True)
+    candidate: Mapped[int]
+    champion: Mapped[str] = mapped_column(Text)
     """A reference: `connect_four@3`, or `script:random` if there was no champion."""
-    settings: dict[str, Any]
-    outcome: str | None
-    evidence: dict[str, Any] | None
-    opened_at: datetime
-    closed_at: datetime | None
+    settings: Mapped[dict[str, Any]]
+    outcome: Mapped[str | None] = mapped_column(String(16))
+    evidence: Mapped[dict[str, Any] | None]
+    opened_at: Mapped[datetime]
+    closed_at: Mapped[datetime | None]
 
     @property
     def schedule(self) -> str:
@@ -373,36 +401,40 @@ class VerdictRow:
         return float(self.settings["gate"]["alpha"])
 
 
-@dataclass(frozen=True, slots=True)
-class NightlyRunRow:
+class NightlyRunRow(Record, kw_only=True):
     """A nightly run of a league; `ended_at` and `report` are None while it runs."""
 
-    id: int
-    league: str
-    candidates: tuple[int, ...]
+    __tablename__ = "nightly_runs"
+    __table_args__ = (Index("ix_nightly_runs_league_id", "league", "id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True, default=None)
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
+    candidates: Mapped[tuple[int, ...]]
     """Version numbers."""
-    alpha: float
+    alpha: Mapped[float]
     """Alpha of each verdict."""
-    report: dict[str, Any] | None
-    began_at: datetime
-    ended_at: datetime | None
+    report: Mapped[dict[str, Any] | None] = mapped_column(default=None)
+    began_at: Mapped[datetime]
+    ended_at: Mapped[datetime | None] = mapped_column(default=None)
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingNightRow:
+class TrainingNightRow(Record, kw_only=True):
     """A night of training of a league; `ended_at` is None while it runs."""
 
-    id: int
+    __tablename__ = "training_nights"
+    __table_args__ = (Index("ix_training_nights_league_id", "league", "id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True, default=None)
     """Unique among all leagues."""
-    number: int
+    number: Mapped[int]
     """Its place among the nights of the league, from 1."""
-    league: str
-    parent: int | None
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
+    parent: Mapped[int | None]
     """The champion when it began, or without one the newest version."""
-    steps: dict[str, Any]
+    steps: Mapped[dict[str, Any]]
     """step → result of each complete step"""
-    began_at: datetime
-    ended_at: datetime | None
+    began_at: Mapped[datetime]
+    ended_at: Mapped[datetime | None] = mapped_column(default=None)
 
     @property
     def start(self) -> int | None:
@@ -427,70 +459,99 @@ class TrainingNightRow:
 EvaluationState = Literal["queued", "running", "done", "failed", "stopped"]
 
 
-@dataclass(frozen=True, slots=True)
-class EvaluationRow:
+class EvaluationRow(Record, kw_only=True):
     """An evaluation that a client requested."""
 
-    id: int
-    league: str
-    request: dict[str, Any]
-    state: EvaluationState
-    progress: dict[str, Any] | None
+    __tablename__ = "evaluations"
+    __table_args__ = (Index("ix_evaluations_league_id", "league", "id"),)
+
+    id: Mapped[int] = mapped_column(primary_key=True, default=None)
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
+    request: Mapped[dict[str, Any]]
+    """A document of league/service_requests.py."""
+    state: Mapped[EvaluationState] = mapped_column(String(16), index=True)
+    progress: Mapped[dict[str, Any] | None] = mapped_column(default=None)
     """`what`, `played` and `of`, about the games in progress."""
-    result: dict[str, Any] | None
+    result: Mapped[dict[str, Any] | None] = mapped_column(default=None)
     """The report, if done."""
-    error: dict[str, str] | None
+    error: Mapped[dict[str, str] | None] = mapped_column(default=None)
     """`code` and `message`, if failed."""
-    actor: str
-    reason: str | None
-    workers: int | None
-    runner: str | None
-    created_at: datetime
-    started_at: datetime | None
-    heartbeat_at: datetime | None
-    stop_at: datetime | None
-    stopped_by: str | None
-    ended_at: datetime | None
+    actor: Mapped[str] = mapped_column(Text)
+    key: Mapped[str | None] = mapped_column(ForeignKey("api_keys.id"))
+    """Id of the client's API key."""
+    reason: Mapped[str | None] = mapped_column(Text)
+    workers: Mapped[int | None] = mapped_column(default=None)
+    """Number of concurrent worker processes."""
+    runner: Mapped[str | None] = mapped_column(String(64), default=None)
+    """The process that runs it, or ran it last."""
+    attempts: Mapped[int] = mapped_column(default=0)
+    """Runners that started since the last progress."""
+    created_at: Mapped[datetime]
+    started_at: Mapped[datetime | None] = mapped_column(default=None)
+    heartbeat_at: Mapped[datetime | None] = mapped_column(default=None)
+    stop_at: Mapped[datetime | None] = mapped_column(default=None)
+    """When its end was requested."""
+    stopped_by: Mapped[str | None] = mapped_column(Text, default=None)
+    ended_at: Mapped[datetime | None] = mapped_column(default=None)
 
 
-@dataclass(frozen=True, slots=True)
-class SnapshotRow:
-    """A precomputed document of a league. `mark` identifies the data that it was computed from."""
+class SnapshotRow(Record, kw_only=True):
+    """A precomputed document of a league, see evaluation/service/snapshots.py."""
 
-    document: Any
-    mark: str
-    at: datetime
+    __tablename__ = "snapshots"
+
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
+    part: Mapped[str] = mapped_column(String(300), primary_key=True)
+    mark: Mapped[str] = mapped_column(Text)
+    """Identifies the data that it was computed from."""
+    document: Mapped[Any] = mapped_column(JSON)
+    at: Mapped[datetime]
 
 
 RunState = Literal["running", "silent", "ended", "failed", "stopped"]
+HEARTBEAT_TIMEOUT = timedelta(minutes=1)
+"""A run without a heartbeat for longer is silent."""
 
 
-@dataclass(frozen=True, slots=True)
-class RunRow:
-    """A training run. `steps`, `seconds` of training and `curves` are the latest reported values."""
+class RunRow(Record, kw_only=True):
+    """A training run. `steps`, `seconds` of training and `curves` are the latest values that its driver reported."""
 
-    league: str
-    id: str
-    algorithm: str
-    settings: dict[str, Any]
-    seed: int
-    target: int | None
+    __tablename__ = "runs"
+
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
+    id: Mapped[str] = mapped_column(String(64), primary_key=True)
+    algorithm: Mapped[str] = mapped_column(String(32))
+    settings: Mapped[dict[str, Any]]
+    seed: Mapped[int] = mapped_column(BigInteger)
+    target: Mapped[int | None] = mapped_column(BigInteger)
     """Steps at which it ends; None if only its time is limited."""
-    parent: int | None
+    parent: Mapped[int | None]
     """The version that training starts from."""
-    exploits: str | None
+    exploits: Mapped[str | None] = mapped_column(Text)
     """The version that an exploiter is trained against."""
-    state: RunState
-    """`silent`: running without a recent heartbeat."""
-    error: str | None
-    attempts: int
+    reported_state: Mapped[RunState] = mapped_column("state", String(16))
+    """The state without `silent`."""
+    error: Mapped[str | None] = mapped_column(Text)
+    attempts: Mapped[int]
     """How often it was started or resumed."""
-    steps: int
-    seconds: float
-    curves: dict[str, float]
-    began_at: datetime
-    heartbeat_at: datetime
-    ended_at: datetime | None
+    driver: Mapped[str] = mapped_column(Text)
+    """The process that trains it, or trained it last, see `league.registry.processes.this_process`."""
+    record: Mapped[dict[str, Any] | None] = mapped_column(deferred=True, compare=False, repr=False)
+    """What another machine needs to continue it, the content of its file `run.json`; None if it cannot."""
+    steps: Mapped[int] = mapped_column(BigInteger)
+    seconds: Mapped[float]
+    curves: Mapped[dict[str, float]]
+    spacing: Mapped[int] = mapped_column(BigInteger)
+    """Minimum steps between two points, which bounds their number."""
+    began_at: Mapped[datetime]
+    heartbeat_at: Mapped[datetime]
+    ended_at: Mapped[datetime | None]
+
+    @property
+    def state(self) -> RunState:
+        """`silent`: running without a recent heartbeat."""
+        is_silent = self.reported_state == "running" and datetime.now(UTC) - self.heartbeat_at > HEARTBEAT_TIMEOUT
+        return "silent" if is_silent else self.reported_state
 
     @property
     def role(self) -> Role:
@@ -498,41 +559,41 @@ class RunRow:
         return MAIN if self.exploits is None else EXPLOITER
 
 
-@dataclass(frozen=True, slots=True)
-class StoredRun:
-    """What a machine needs to continue a training run that began on another one."""
-
-    id: str
-    state: RunState
-    driver: str
-    """The process that trains it, or trained it last, see `league.registry.processes.this_process`."""
-    heartbeat_at: datetime
-    record: dict[str, Any]
-    """The content of its file `run.json`."""
-
-
-@dataclass(frozen=True, slots=True)
-class RunPoint:
+class RunPoint(Record):
     """Values of a run's curves at a step."""
 
-    steps: int
-    curves: dict[str, float]
-    at: datetime
+    __tablename__ = "run_points"
+    __table_args__ = (ForeignKeyConstraint(["league", "run"], ["runs.league", "runs.id"]),)
+
+    league: Mapped[str] = mapped_column(String(255), primary_key=True)
+    run: Mapped[str] = mapped_column(String(64), primary_key=True)
+    steps: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
+    curves: Mapped[dict[str, float]]
+    at: Mapped[datetime]
 
 
-@dataclass(frozen=True, slots=True)
-class StrengthRow:
+class StrengthRow(Record, kw_only=True):
     """The score of a version in the matches that its training run played against an opponent."""
 
-    version: int
-    steps: int
-    opponent: str
-    games: int
-    score: float
-    low: float
-    high: float
+    __tablename__ = "strengths"
+    __table_args__ = (
+        ForeignKeyConstraint(["league", "version"], ["versions.league", "versions.number"]),
+        Index("ix_strengths_league_run", "league", "run"),
+    )
+
+    league: Mapped[str] = mapped_column(String(255), primary_key=True)
+    version: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    opponent: Mapped[str] = mapped_column(String(512), primary_key=True)
+    """A fixed reference."""
+    run: Mapped[str] = mapped_column(String(64))
+    steps: Mapped[int] = mapped_column(BigInteger)
+    """Actions of the run before the version, with those of its parent versions."""
+    games: Mapped[int]
+    score: Mapped[float]
+    low: Mapped[float]
+    high: Mapped[float]
     """Bounds of the 95 % interval."""
-    at: datetime
+    at: Mapped[datetime]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,10 @@
-"""ORM classes of the registry's tables. Each change needs a migration in `migrations/versions/`."""
+"""Tables that only the registry and the ledger read. Those whose rows they return are in `rows.py`.
+
+Each change of a table needs a migration in `migrations/versions/`.
+"""
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, ClassVar
 
 from sqlalchemy import (
     JSON,
@@ -46,9 +49,35 @@ class Utc(TypeDecorator[datetime]):
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
+class JsonCollection(TypeDecorator[Any]):
+    """A tuple or frozenset of strings or numbers, stored as a sorted JSON list. kind: its type."""
+
+    impl = JSON
+    cache_ok = True
+
+    def __init__(self, kind: type[tuple[Any, ...]] | type[frozenset[Any]]) -> None:
+        super().__init__(none_as_null=True)
+        self.kind = kind
+
+    def process_bind_param(self, value: Any, dialect: Dialect) -> list[Any] | None:  # noqa: ARG002
+        return None if value is None else sorted(value)
+
+    def process_result_value(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002
+        return None if value is None else self.kind(value)
+
+
 class Base(DeclarativeBase):
     """Base of the ORM classes. Names every constraint, so that a migration can drop it on any database."""
 
+    type_annotation_map: ClassVar[dict[Any, Any]] = {
+        datetime: Utc,
+        float: Double,
+        frozenset[str]: JsonCollection(frozenset),
+        tuple[int, ...]: JsonCollection(tuple),
+        **dict.fromkeys(
+            (dict[str, Any], dict[str, float], dict[str, int], dict[str, str], list[int]), JSON(none_as_null=True)
+        ),
+    }
     metadata = MetaData(
         naming_convention={
             "ix": "ix_%(table_name)s_%(column_0_N_name)s",
@@ -57,38 +86,6 @@ class Base(DeclarativeBase):
             "pk": "pk_%(table_name)s",
         }
     )
-
-
-class LeagueTable(Base):
-    """A registered league. Its row is the lock for all changes to the league."""
-
-    __tablename__ = "leagues"
-
-    slug: Mapped[str] = mapped_column(String(255), primary_key=True)
-    config: Mapped[dict[str, Any]] = mapped_column(JSON)
-    interface: Mapped[dict[str, Any]] = mapped_column(JSON)
-    interface_digest: Mapped[str] = mapped_column(String(64))
-    environment_digest: Mapped[str] = mapped_column(String(64))
-    game: Mapped[dict[str, Any]] = mapped_column(JSON)
-    """What decides results, see LeagueConfig.game."""
-    game_digest: Mapped[str] = mapped_column(String(64))
-    last_version: Mapped[int]
-    """The highest number ever reserved. Numbers are never reused."""
-    registered_at: Mapped[datetime] = mapped_column(Utc)
-    archived_at: Mapped[datetime | None] = mapped_column(Utc)
-
-
-class EarlierGameTable(Base):
-    """A game that a league had before its environment's code or its rules changed. Its results are kept apart."""
-
-    __tablename__ = "earlier_games"
-
-    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
-    digest: Mapped[str] = mapped_column(String(64), primary_key=True)
-    game: Mapped[dict[str, Any]] = mapped_column(JSON)
-    """As in `leagues`."""
-    replaced_at: Mapped[datetime] = mapped_column(Utc)
-    """When the league had this game last."""
 
 
 class VersionTable(Base):
@@ -118,12 +115,12 @@ class VersionTable(Base):
     """As in the manifest."""
     publisher: Mapped[str] = mapped_column(Text)
     """The process that writes it, see `league.registry.processes.this_process`."""
-    reserved_at: Mapped[datetime] = mapped_column(Utc)
+    reserved_at: Mapped[datetime]
     manifest: Mapped[str | None] = mapped_column(Text)
     """manifest.json, byte for byte; null until ready."""
     sha256: Mapped[str | None] = mapped_column(String(64))
     """Digest of manifest.json, which contains the digests of all other files."""
-    retired_at: Mapped[datetime | None] = mapped_column(Utc)
+    retired_at: Mapped[datetime | None]
     """From then on the version has no files."""
 
 
@@ -142,30 +139,7 @@ class VersionNoteTable(Base):
     version: Mapped[int]
     text: Mapped[str] = mapped_column(Text)
     actor: Mapped[str] = mapped_column(Text)
-    at: Mapped[datetime] = mapped_column(Utc)
-
-
-class AliasEventTable(Base):
-    """A change of an alias with actor, reason and verdict. Rows are immutable."""
-
-    __tablename__ = "alias_events"
-    __table_args__ = (
-        ForeignKeyConstraint(["league", "version"], ["versions.league", "versions.number"]),
-        Index("ix_alias_events_league_alias_id", "league", "alias", "id"),
-    )
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    league: Mapped[str] = mapped_column(String(255))
-    alias: Mapped[str] = mapped_column(String(255))
-    kind: Mapped[str] = mapped_column(String(16))
-    version: Mapped[int]
-    previous: Mapped[int | None]
-    beneath: Mapped[int | None] = mapped_column(ForeignKey("alias_events.id"))
-    """The event that a rollback of this one returns to."""
-    actor: Mapped[str] = mapped_column(Text)
-    reason: Mapped[str] = mapped_column(Text)
-    verdict: Mapped[str | None] = mapped_column(ForeignKey("verdicts.id"))
-    at: Mapped[datetime] = mapped_column(Utc)
+    at: Mapped[datetime]
 
 
 class AliasTable(Base):
@@ -202,13 +176,13 @@ class AcknowledgementTable(Base):
     version: Mapped[int | None]
     sha256: Mapped[str | None] = mapped_column(String(64))
     fault: Mapped[str | None] = mapped_column(Text)
-    aliases: Mapped[dict[str, int]] = mapped_column(JSON)
+    aliases: Mapped[dict[str, int]]
     """alias → version that it serves"""
     traffic: Mapped[int | None]
     """Id of the traffic setting that it follows."""
     event: Mapped[int | None]
     """Id of the newest alias event of the league that it has read."""
-    seen_at: Mapped[datetime] = mapped_column(Utc, index=True)
+    seen_at: Mapped[datetime] = mapped_column(index=True)
 
 
 class ReplicaTable(Base):
@@ -217,7 +191,7 @@ class ReplicaTable(Base):
     __tablename__ = "replicas"
 
     replica: Mapped[str] = mapped_column(String(255), primary_key=True)
-    process: Mapped[dict[str, str]] = mapped_column(JSON)
+    process: Mapped[dict[str, str]]
     """Where it runs: from this, other replicas can tell that it has ended."""
     changes: Mapped[int | None] = mapped_column(BigInteger)
     """Changes that it has read, as in ReadPosition; null until it has read any."""
@@ -225,7 +199,7 @@ class ReplicaTable(Base):
     """Newest alias event that it has read, as in ReadPosition."""
     traffic: Mapped[int | None]
     """Newest traffic setting that it has read, as in ReadPosition."""
-    seen_at: Mapped[datetime] = mapped_column(Utc, index=True)
+    seen_at: Mapped[datetime] = mapped_column(index=True)
     """Time of its last report, by the clock of the database."""
 
 
@@ -239,12 +213,12 @@ class TrafficEventTable(Base):
     league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
     canary: Mapped[str | None] = mapped_column(String(255))
     """A number or an alias."""
-    canary_share: Mapped[float | None] = mapped_column(Double)
+    canary_share: Mapped[float | None]
     shadow: Mapped[str | None] = mapped_column(String(255))
-    shadow_share: Mapped[float | None] = mapped_column(Double)
+    shadow_share: Mapped[float | None]
     actor: Mapped[str] = mapped_column(Text)
     reason: Mapped[str] = mapped_column(Text)
-    at: Mapped[datetime] = mapped_column(Utc)
+    at: Mapped[datetime]
 
 
 class ShadowCountTable(Base):
@@ -266,10 +240,10 @@ class ShadowCountTable(Base):
     failed: Mapped[int] = mapped_column(BigInteger)
     dropped: Mapped[int] = mapped_column(BigInteger)
     skipped: Mapped[int] = mapped_column(BigInteger)
-    latency: Mapped[list[int]] = mapped_column(JSON)
+    latency: Mapped[list[int]]
     """Counts in the buckets of league/histograms.py."""
     ns: Mapped[int] = mapped_column(BigInteger)
-    at: Mapped[datetime] = mapped_column(Utc, index=True)
+    at: Mapped[datetime] = mapped_column(index=True)
 
 
 class ReplicaReportTable(Base):
@@ -278,25 +252,8 @@ class ReplicaReportTable(Base):
     __tablename__ = "reports"
 
     replica: Mapped[str] = mapped_column(String(255), primary_key=True)
-    document: Mapped[dict[str, Any]] = mapped_column(JSON)
-    at: Mapped[datetime] = mapped_column(Utc, index=True)
-
-
-class ApiKeyTable(Base):
-    """An API key. Rows are never deleted: `revoked_at` ends a key."""
-
-    __tablename__ = "api_keys"
-
-    id: Mapped[str] = mapped_column(String(8), primary_key=True)
-    name: Mapped[str] = mapped_column(String(255), unique=True)
-    sha256: Mapped[str] = mapped_column(String(64), unique=True)
-    """Digest of the key's text, which is not stored."""
-    scopes: Mapped[list[str]] = mapped_column(JSON)
-    leagues: Mapped[list[str] | None] = mapped_column(JSON(none_as_null=True))
-    rate: Mapped[float | None] = mapped_column(Double)
-    created_at: Mapped[datetime] = mapped_column(Utc)
-    expires_at: Mapped[datetime | None] = mapped_column(Utc)
-    revoked_at: Mapped[datetime | None] = mapped_column(Utc)
+    document: Mapped[dict[str, Any]]
+    at: Mapped[datetime] = mapped_column(index=True)
 
 
 class IdempotentCallTable(Base):
@@ -311,7 +268,7 @@ class IdempotentCallTable(Base):
     event: Mapped[int | None] = mapped_column(ForeignKey("alias_events.id"))
     traffic: Mapped[int | None] = mapped_column(ForeignKey("traffic_events.id"))
     evaluation: Mapped[int | None] = mapped_column(ForeignKey("evaluations.id"))
-    at: Mapped[datetime] = mapped_column(Utc, index=True)
+    at: Mapped[datetime] = mapped_column(index=True)
 
 
 class ScheduleTable(Base):
@@ -324,8 +281,8 @@ class ScheduleTable(Base):
     league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), index=True)
     kind: Mapped[str] = mapped_column(String(32))
     document: Mapped[str] = mapped_column(Text)
-    opened_at: Mapped[datetime] = mapped_column(Utc)
-    purged_at: Mapped[datetime | None] = mapped_column(Utc)
+    opened_at: Mapped[datetime]
+    purged_at: Mapped[datetime | None]
     """From then on its matches are stored but not counted."""
 
 
@@ -353,174 +310,4 @@ class MatchTable(Base):
     """Sums over the games per contestant, a JSON list. Ratings read nothing else."""
     moves: Mapped[str] = mapped_column(Text)
     """The complete games, as written by `league.results.records.dump_games`."""
-    played_at: Mapped[datetime] = mapped_column(Utc)
-
-
-class VerdictTable(Base):
-    """A verdict of a gate with its evidence. `outcome` is null while it is open."""
-
-    __tablename__ = "verdicts"
-    __table_args__ = (ForeignKeyConstraint(["league", "candidate"], ["versions.league", "versions.number"]),)
-
-    id: Mapped[str] = mapped_column(String(255), primary_key=True)
-    """Id of the schedule whose matches it counts."""
-    league: Mapped[str] = mapped_column(String(255), index=True)
-    candidate: Mapped[int]
-    champion: Mapped[str] = mapped_column(Text)
-    settings: Mapped[dict[str, Any]] = mapped_column(JSON)
-    outcome: Mapped[str | None] = mapped_column(String(16))
-    evidence: Mapped[dict[str, Any] | None] = mapped_column(JSON)
-    opened_at: Mapped[datetime] = mapped_column(Utc)
-    closed_at: Mapped[datetime | None] = mapped_column(Utc)
-
-
-class NightlyRunTable(Base):
-    """A nightly run with its candidates and its report. Open until `ended_at`."""
-
-    __tablename__ = "nightly_runs"
-    __table_args__ = (Index("ix_nightly_runs_league_id", "league", "id"),)
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
-    candidates: Mapped[list[int]] = mapped_column(JSON)
-    """Version numbers."""
-    alpha: Mapped[float] = mapped_column(Double)
-    """Alpha of each verdict."""
-    report: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
-    began_at: Mapped[datetime] = mapped_column(Utc)
-    ended_at: Mapped[datetime | None] = mapped_column(Utc)
-
-
-class TrainingNightTable(Base):
-    """A night of training: the results of its steps. Open until `ended_at`."""
-
-    __tablename__ = "training_nights"
-    __table_args__ = (Index("ix_training_nights_league_id", "league", "id"),)
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
-    parent: Mapped[int | None]
-    """The version that training continues from."""
-    steps: Mapped[dict[str, Any]] = mapped_column(JSON)
-    """step → result of each complete step"""
-    began_at: Mapped[datetime] = mapped_column(Utc)
-    ended_at: Mapped[datetime | None] = mapped_column(Utc)
-
-
-class EvaluationTable(Base):
-    """An evaluation with its request, runner, progress and result."""
-
-    __tablename__ = "evaluations"
-    __table_args__ = (Index("ix_evaluations_league_id", "league", "id"),)
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"))
-    request: Mapped[dict[str, Any]] = mapped_column(JSON)
-    """A document of league/service_requests.py."""
-    state: Mapped[str] = mapped_column(String(16), index=True)
-    progress: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
-    result: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
-    error: Mapped[dict[str, str] | None] = mapped_column(JSON(none_as_null=True))
-    """`code` and `message` of the error."""
-    actor: Mapped[str] = mapped_column(Text)
-    key: Mapped[str | None] = mapped_column(ForeignKey("api_keys.id"))
-    """The API key of the client."""
-    reason: Mapped[str | None] = mapped_column(Text)
-    workers: Mapped[int | None]
-    """Number of concurrent worker processes."""
-    runner: Mapped[str | None] = mapped_column(String(64))
-    """The process that runs it, or ran it last."""
-    attempts: Mapped[int]
-    """Runners that started since the last progress."""
-    created_at: Mapped[datetime] = mapped_column(Utc)
-    started_at: Mapped[datetime | None] = mapped_column(Utc)
-    heartbeat_at: Mapped[datetime | None] = mapped_column(Utc)
-    stop_at: Mapped[datetime | None] = mapped_column(Utc)
-    """When its end was requested."""
-    stopped_by: Mapped[str | None] = mapped_column(Text)
-    ended_at: Mapped[datetime | None] = mapped_column(Utc)
-
-
-class SnapshotTable(Base):
-    """A precomputed document of a league, see evaluation/service/snapshots.py."""
-
-    __tablename__ = "snapshots"
-
-    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
-    part: Mapped[str] = mapped_column(String(300), primary_key=True)
-    mark: Mapped[str] = mapped_column(Text)
-    """Identifies the data that it was computed from."""
-    document: Mapped[Any] = mapped_column(JSON)
-    at: Mapped[datetime] = mapped_column(Utc)
-
-
-class RunTable(Base):
-    """A training run, as reported by its driver."""
-
-    __tablename__ = "runs"
-
-    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
-    id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    algorithm: Mapped[str] = mapped_column(String(32))
-    settings: Mapped[dict[str, Any]] = mapped_column(JSON)
-    seed: Mapped[int] = mapped_column(BigInteger)
-    target: Mapped[int | None] = mapped_column(BigInteger)
-    """Steps at which it ends, if they are limited."""
-    parent: Mapped[int | None]
-    """The version that training starts from."""
-    exploits: Mapped[str | None] = mapped_column(Text)
-    """The version that an exploiter is trained against."""
-    state: Mapped[str] = mapped_column(String(16))
-    error: Mapped[str | None] = mapped_column(Text)
-    attempts: Mapped[int]
-    """How often it was started or resumed."""
-    driver: Mapped[str] = mapped_column(Text)
-    """The process that trains it, or trained it last, see `league.registry.processes.this_process`."""
-    record: Mapped[dict[str, Any] | None] = mapped_column(JSON, deferred=True)
-    """What another machine needs to continue it; null if it cannot."""
-    steps: Mapped[int] = mapped_column(BigInteger)
-    seconds: Mapped[float] = mapped_column(Double)
-    curves: Mapped[dict[str, float]] = mapped_column(JSON)
-    """Latest value of each curve."""
-    spacing: Mapped[int] = mapped_column(BigInteger)
-    """Minimum steps between two points, which bounds their number."""
-    began_at: Mapped[datetime] = mapped_column(Utc)
-    heartbeat_at: Mapped[datetime] = mapped_column(Utc)
-    ended_at: Mapped[datetime | None] = mapped_column(Utc)
-
-
-class RunPointTable(Base):
-    """Values of a run's curves at a step."""
-
-    __tablename__ = "run_points"
-    __table_args__ = (ForeignKeyConstraint(["league", "run"], ["runs.league", "runs.id"]),)
-
-    league: Mapped[str] = mapped_column(String(255), primary_key=True)
-    run: Mapped[str] = mapped_column(String(64), primary_key=True)
-    steps: Mapped[int] = mapped_column(BigInteger, primary_key=True, autoincrement=False)
-    curves: Mapped[dict[str, float]] = mapped_column(JSON)
-    at: Mapped[datetime] = mapped_column(Utc)
-
-
-class StrengthTable(Base):
-    """The score of a version in the matches that its training run played against an opponent."""
-
-    __tablename__ = "strengths"
-    __table_args__ = (
-        ForeignKeyConstraint(["league", "version"], ["versions.league", "versions.number"]),
-        Index("ix_strengths_league_run", "league", "run"),
-    )
-
-    league: Mapped[str] = mapped_column(String(255), primary_key=True)
-    version: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    opponent: Mapped[str] = mapped_column(String(512), primary_key=True)
-    """A fixed reference."""
-    run: Mapped[str] = mapped_column(String(64))
-    steps: Mapped[int] = mapped_column(BigInteger)
-    """Actions of the run before the version, with those of its parent versions."""
-    games: Mapped[int]
-    score: Mapped[float] = mapped_column(Double)
-    low: Mapped[float] = mapped_column(Double)
-    high: Mapped[float] = mapped_column(Double)
-    """Bounds of the 95 % interval."""
-    at: Mapped[datetime] = mapped_column(Utc)
+    played_at: Mapped[datetime]

@@ -6,8 +6,9 @@ A driver sends heartbeats; a run without a recent heartbeat is `silent`. The num
 there are too many, every second point is deleted, and the spacing of new points doubles.
 """
 
-from datetime import UTC, datetime, timedelta
-from typing import Any, cast
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
 
 from sqlalchemy import delete, func, select, tuple_
 from sqlalchemy.orm import Session, undefer
@@ -16,12 +17,9 @@ from league.errors import InvalidInput, InvalidReference, UnknownRun
 from league.registry import leagues
 from league.registry.processes import this_process
 from league.registry.storage.database import Repository
-from league.registry.storage.rows import RunPoint, RunRow, RunState, StoredRun, detached
-from league.registry.storage.tables import RunPointTable, RunTable
+from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunPoint, RunRow, RunState
 
 RUNNING = "running"
-HEARTBEAT_TIMEOUT = timedelta(minutes=1)
-"""A run without a heartbeat for longer is reported as silent."""
 MAX_STORED = 20
 """Newest runs that are searched for one to continue."""
 MAX_LISTED = 5
@@ -56,20 +54,38 @@ class RunRepository(Repository):
         started_at = datetime.now(UTC)
         with self._database.write() as session:
             leagues.require(session, league)
-            row = session.get(RunTable, (league, run), with_for_update=True)
+            values: dict[str, Any] = {
+                "algorithm": algorithm,
+                "settings": settings,
+                "seed": seed,
+                "target": target,
+                "parent": parent,
+                "exploits": exploits,
+                "reported_state": RUNNING,
+                "error": None,
+                "driver": this_process(),
+                "record": record,
+                "steps": steps,
+                "heartbeat_at": started_at,
+                "ended_at": None,
+            }
+            row = session.get(RunRow, (league, run), with_for_update=True)
             if row is None:
-                row = RunTable(
-                    league=league, id=run, attempts=0, seconds=0.0, curves={}, spacing=0, began_at=started_at
-                )
+                first: dict[str, Any] = {
+                    "attempts": 0,
+                    "seconds": 0.0,
+                    "curves": {},
+                    "spacing": 0,
+                    "began_at": started_at,
+                }
+                row = RunRow(league=league, id=run, **first, **values)
                 session.add(row)
-            row.algorithm, row.settings, row.seed, row.target, row.parent = algorithm, settings, seed, target, parent
-            row.exploits, row.record, row.driver = exploits, record, this_process()
-            row.state, row.error, row.ended_at = RUNNING, None, None
+            for name, value in values.items():
+                setattr(row, name, value)
             row.attempts += 1
-            row.steps, row.heartbeat_at = steps, started_at
             session.flush()
-            session.execute(delete(RunPointTable).filter_by(league=league, run=run).where(RunPointTable.steps > steps))
-            return _row(row)
+            session.execute(delete(RunPoint).filter_by(league=league, run=run).where(RunPoint.steps > steps))
+            return row
 
     def record(self, league: str, run: str, point: RunPoint | None, seconds: float | None = None) -> None:
         """Record a heartbeat of a run's driver and the newest point of its curves, if any. Raises UnknownRun.
@@ -89,7 +105,7 @@ class RunRepository(Repository):
         """Record how a run ended. Raises UnknownRun."""
         with self._database.write() as session:
             row = _locked(session, league, run)
-            row.state, row.error = state, error
+            row.reported_state, row.error = state, error
             row.heartbeat_at = row.ended_at = datetime.now(UTC)
 
     def get(self, league: str, run: str) -> RunRow:
@@ -103,7 +119,7 @@ class RunRepository(Repository):
         Raises UnknownRun, or InvalidReference with the candidates if there are several.
         """
         league, _, run = text.rpartition("/")
-        table = RunTable
+        table = RunRow
         query = select(table).order_by(table.began_at.desc(), table.league, table.id)
         if league:
             query = query.filter_by(league=league)
@@ -111,7 +127,7 @@ class RunRepository(Repository):
             candidates = list(session.scalars(query.where(table.id.startswith(run, autoescape=True)))) if run else []
             exact = [row for row in candidates if row.id == run]
             if len(candidates := exact or candidates) == 1:
-                return _row(candidates[0])
+                return candidates[0]
             listed = ", ".join(
                 f"{row.league}/{row.id}" for row in candidates or session.scalars(query.limit(MAX_LISTED))
             )
@@ -125,7 +141,7 @@ class RunRepository(Repository):
         before: return only runs that began before this one.
         Raises UnknownLeague, or InvalidInput if `before` is not a run of the league.
         """
-        table = RunTable
+        table = RunRow
         query = select(table).filter_by(league=league).order_by(table.began_at.desc(), table.id.desc()).limit(limit)
         with self._database.read() as session:
             leagues.require(session, league)
@@ -134,31 +150,27 @@ class RunRepository(Repository):
                 if last is None:
                     raise InvalidInput(f"before: league {league} has no training run {before!r}")
                 query = query.where(tuple_(table.began_at, table.id) < (last.began_at, last.id))
-            return [_row(row) for row in session.scalars(query)]
+            return list(session.scalars(query))
 
-    def stored(self, league: str, run: str | None = None) -> list[StoredRun]:
+    def stored(self, league: str, run: str | None = None) -> list[RunRow]:
         """Return the newest runs of a league, or one of them, that can be continued on another machine, newest first.
 
-        Raises UnknownLeague.
+        They have their `record`, which other methods do not read. Raises UnknownLeague.
         """
-        table = RunTable
+        table = RunRow
         query = select(table).filter_by(league=league).order_by(table.began_at.desc(), table.id.desc())
         if run is not None:
             query = query.filter_by(id=run)
         with self._database.read() as session:
             leagues.require(session, league)
-            rows = session.scalars(query.options(undefer(table.record)).limit(MAX_STORED))
-            return [
-                StoredRun(row.id, _state(row), row.driver, row.heartbeat_at, row.record)
-                for row in rows
-                if row.record is not None
-            ]
+            with_records = query.options(undefer(table.record)).where(table.record.is_not(None))
+            return list(session.scalars(with_records.limit(MAX_STORED)))
 
     def counts(self) -> dict[str, int]:
         """Return league → number of active training runs, of the leagues that have any."""
-        alive = (RunTable.state == RUNNING) & (RunTable.heartbeat_at >= datetime.now(UTC) - HEARTBEAT_TIMEOUT)
+        alive = (RunRow.reported_state == RUNNING) & (RunRow.heartbeat_at >= datetime.now(UTC) - HEARTBEAT_TIMEOUT)
         with self._database.read() as session:
-            rows = session.execute(select(RunTable.league, func.count()).where(alive).group_by(RunTable.league))
+            rows = session.execute(select(RunRow.league, func.count()).where(alive).group_by(RunRow.league))
             return dict(rows.tuples().all())
 
     def points(self, league: str, run: str) -> list[RunPoint]:
@@ -166,59 +178,49 @@ class RunRepository(Repository):
 
         Raises UnknownLeague or UnknownRun.
         """
-        table = RunPointTable
-        query = select(table.steps, table.curves, table.at).filter_by(league=league, run=run).order_by(table.steps)
+        table = RunPoint
+        query = select(table).filter_by(league=league, run=run).order_by(table.steps)
         with self._database.read() as session:
             _get(session, league, run)
-            return [RunPoint(*values) for values in session.execute(query).tuples()]
+            return list(session.scalars(query))
 
 
 def active(session: Session, league: str) -> tuple[RunRow, ...]:
     """Return the runs of a league in state `running` or `silent`, oldest first."""
-    query = select(RunTable).filter_by(league=league, state=RUNNING).order_by(RunTable.began_at, RunTable.id)
-    return tuple(_row(row) for row in session.scalars(query))
+    query = select(RunRow).filter_by(league=league, reported_state=RUNNING).order_by(RunRow.began_at, RunRow.id)
+    return tuple(session.scalars(query))
 
 
 def is_trained(session: Session, league: str) -> bool:
     """Whether a run of the league sends heartbeats."""
-    current_time = datetime.now(UTC)
-    return any(current_time - run.heartbeat_at < HEARTBEAT_TIMEOUT for run in active(session, league))
+    return any(run.state == RUNNING for run in active(session, league))
 
 
 def _get(session: Session, league: str, run: str) -> RunRow:
     leagues.require(session, league)
-    return _row(session.get(RunTable, (league, run)) or _unknown(league, run))
+    return session.get(RunRow, (league, run)) or _unknown(league, run)
 
 
-def _locked(session: Session, league: str, run: str) -> RunTable:
-    return session.get(RunTable, (league, run), with_for_update=True) or _unknown(league, run)
+def _locked(session: Session, league: str, run: str) -> RunRow:
+    return session.get(RunRow, (league, run), with_for_update=True) or _unknown(league, run)
 
 
-def _unknown(league: str, run: str) -> RunTable:
+def _unknown(league: str, run: str) -> RunRow:
     raise UnknownRun(f"league {league} has no training run {run!r}")
 
 
-def _keep(session: Session, row: RunTable, point: RunPoint) -> None:
+def _keep(session: Session, row: RunRow, point: RunPoint) -> None:
     """Store the newest point; delete the one before it unless that is far enough from its own predecessor."""
-    table = RunPointTable
+    table = RunPoint
     of_run = (table.league == row.league) & (table.run == row.id)
     session.execute(delete(table).where(of_run, table.steps >= point.steps))
     newest = session.scalars(select(table.steps).where(of_run).order_by(table.steps.desc()).limit(2)).all()
     if len(newest) == 2 and newest[0] - newest[1] < row.spacing:
         session.execute(delete(table).where(of_run, table.steps == newest[0]))
-    session.add(table(league=row.league, run=row.id, steps=point.steps, curves=point.curves, at=point.at))
+    session.add(replace(point))  # the driver's own is not of this transaction
     session.flush()
     kept = session.scalars(select(table.steps).where(of_run).order_by(table.steps)).all()
     if len(kept) >= MAX_POINTS:
         session.execute(delete(table).where(of_run, table.steps.in_(kept[1::2])))
         # Points are not equidistant: a spacing below the mean distance still keeps only every second point.
         row.spacing = (kept[-1] - kept[0]) * 3 // (4 * len(kept[2::2]))
-
-
-def _row(run: RunTable) -> RunRow:
-    return detached(RunRow, run, state=_state(run))
-
-
-def _state(run: RunTable) -> RunState:
-    is_silent = run.state == RUNNING and run.heartbeat_at < datetime.now(UTC) - HEARTBEAT_TIMEOUT
-    return "silent" if is_silent else cast(RunState, run.state)

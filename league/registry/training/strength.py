@@ -4,33 +4,33 @@ The games are not in the ledger: their results are no evidence, because a run pl
 again. They are kept here to show the progress of the run.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import asdict
 
 from sqlalchemy import select
 
 from league.registry import leagues
 from league.registry.storage.database import Repository, insert
-from league.registry.storage.rows import StrengthRow, detached
-from league.registry.storage.tables import StrengthTable
+from league.registry.storage.rows import StrengthRow
 
 
 class StrengthRepository(Repository):
     """Records and reads the strength of versions."""
 
-    def record(self, league: str, run: str, rows: Iterable[StrengthRow]) -> None:
+    def record(self, rows: Sequence[StrengthRow]) -> None:
         """Record scores of versions that a run has published. Scores that are recorded already are kept.
 
         Raises UnknownLeague.
         """
         with self._database.write() as session:
-            leagues.require(session, league)
-            insert(session, StrengthTable, [{"league": league, "run": run} | asdict(row) for row in rows])
+            for league in {row.league for row in rows}:
+                leagues.require(session, league)
+            insert(session, StrengthRow, [asdict(row) for row in rows])
 
     def of_run(self, league: str, run: str) -> list[StrengthRow]:
         """Return the scores of a run's versions, oldest version first. Raises UnknownLeague."""
-        table = StrengthTable
+        table = StrengthRow
         query = select(table).filter_by(league=league, run=run).order_by(table.version, table.at, table.opponent)
         with self._database.read() as session:
             leagues.require(session, league)
-            return [detached(StrengthRow, row) for row in session.scalars(query)]
+            return list(session.scalars(query))

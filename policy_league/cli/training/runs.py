@@ -1,7 +1,6 @@
 """`league runs`."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -64,5 +63,6 @@ def _score(row: "StrengthRow", league: str) -> str:
 def _run_document(row: "RunRow", strength: "Sequence[StrengthRow]") -> dict[str, object]:
     names = "state", "role", "exploits", "algorithm", "seed", "steps", "target", "seconds", "parent", "error"
     times = "began_at", "heartbeat_at", "ended_at"
-    scores = [asdict(measurement) for measurement in strength]
+    fields = "version", "steps", "opponent", "games", "score", "low", "high", "at"
+    scores = [{name: getattr(measurement, name) for name in fields} for measurement in strength]
     return {"run": row.id} | {name: getattr(row, name) for name in (*names, *times)} | {"strength": scores}

@@ -234,7 +234,7 @@ def _moved(event: "AliasEvent", previous: int | None, as_json: bool, replicas: l
     previous: the version that it pointed to until now. If it is that of the event, the event is an earlier one.
     """
     if as_json:
-        emit(asdict(event) | ({} if replicas is None else {"replicas": replicas}))
+        emit(_document(event) | ({} if replicas is None else {"replicas": replicas}))
         return
     if previous == event.version:
         say(f"{event.league}@{event.alias} already points to version {event.version}.")
@@ -260,7 +260,7 @@ def history(
     mixtures = registry.versions.mixtures(league, {event.version for event in events})
     if as_json:
         members = {number: [member.model_dump() for member in one.members] for number, one in mixtures.items()}
-        documents = [asdict(event) | {"members": members.get(event.version)} for event in events]
+        documents = [_document(event) | {"members": members.get(event.version)} for event in events]
         emit({"league": league, "alias": alias, "events": documents})
         return
     if not events:
@@ -281,6 +281,12 @@ def history(
         ],
         prose=("reason",),
     )
+
+
+def _document(event: "AliasEvent") -> dict[str, object]:
+    document = asdict(event)
+    del document["beneath"]
+    return document
 
 
 def _short(verdict: str | None) -> str | None:

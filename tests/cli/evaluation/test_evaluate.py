@@ -9,7 +9,8 @@ from pettingzoo.classic.tictactoe import tictactoe as tictactoe_v3
 from sqlalchemy import select
 
 from league.registry.registry import Registry
-from league.registry.storage.tables import MatchTable, VerdictTable
+from league.registry.storage.rows import VerdictRow
+from league.registry.storage.tables import MatchTable
 from tests.support.command import COMMAND, League, environment
 from tests.support.leagues import tictactoe
 from tests.support.waiting import until
@@ -92,7 +93,7 @@ def test_a_verdict_is_verified_and_a_modified_one_fails(league: League, registry
     result = league("verify", verdict, "--replays", "3")
     assert (result.code, "3 games replayed" in result.out) == (0, True)
     with registry.database.write() as session:
-        row = session.get_one(VerdictTable, verdict)
+        row = session.get_one(VerdictRow, verdict)
         row.evidence = {**row.evidence, "llr": 99.0}  # type: ignore[dict-item]
     refuted = league("verify", verdict)
     assert (refuted.code, refuted.err.count("\n")) == (1, 1)

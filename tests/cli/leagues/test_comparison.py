@@ -20,7 +20,13 @@ def runs(registry: Registry) -> tuple[str, str]:
         registry.runs.record(
             tictactoe.LEAGUE,
             run,
-            RunPoint(600_000, {"shared/return": lr, "opponents/script:nim_bot:act/score": 0.5}, at),
+            RunPoint(
+                tictactoe.LEAGUE,
+                run,
+                600_000,
+                {"shared/return": lr, "opponents/script:nim_bot:act/score": 0.5},
+                at,
+            ),
             seconds=120.0,
         )
     return RUNS

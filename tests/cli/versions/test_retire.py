@@ -9,7 +9,8 @@ import pytest
 from sqlalchemy import update
 
 from league.registry.registry import Registry
-from league.registry.storage.tables import LeagueTable, VersionTable
+from league.registry.storage.rows import LeagueRow
+from league.registry.storage.tables import VersionTable
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 
@@ -71,9 +72,10 @@ def test_versions_and_logs_are_removed_once(league: League, old: Registry, log: 
 def test_a_league_of_another_release_stops_no_other(league: League, old: Registry) -> None:
     with old.database.write() as session:
         session.add(
-            LeagueTable(
-                slug="later", last_version=0, registered_at=datetime.now(UTC), config={"of": "another release"},
-                interface={}, interface_digest="", environment_digest="", game={}, game_digest="",
+            LeagueRow(
+                slug="later", last_version=0, registered_at=datetime.now(UTC), archived_at=None,
+                config_document={"of": "another release"}, interface_document={}, interface_digest="",
+                environment_digest="", game={}, game_digest="",
             )
         )  # fmt: skip
     result = league("retire", "--keep=1", "--yes", "--json")

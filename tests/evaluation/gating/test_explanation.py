@@ -19,7 +19,17 @@ from league.registry.storage.rows import VerdictRow
 from league.verdict_tests import AnchorTest, ExploitabilityTest, ExploiterTest
 
 GATE = GateConfig(model="logistic", elo1=40, alpha=0.05, nights=None, max_blocks=4000)
-VERDICT = VerdictRow("l-verdict-1", "l", 3, "l@2", {}, None, None, datetime.now(UTC), None)
+VERDICT = VerdictRow(
+    id="l-verdict-1",
+    league="l",
+    candidate=3,
+    champion="l@2",
+    settings={},
+    outcome=None,
+    evidence=None,
+    opened_at=datetime.now(UTC),
+    closed_at=None,
+)
 BOT = "script:bots.solver:act"
 EVEN = (10, 20, 40, 20, 10)
 WON = decide(GATE, [0.75] * 400)

@@ -14,7 +14,7 @@ from evaluation.matches.game_records import forfeits
 from league.environments.implementation import implementation
 from league.errors import InvalidInput, NotFound, VerdictRefuted
 from league.registry.registry import Registry
-from league.registry.storage import tables
+from league.registry.storage import rows, tables
 from league.registry.storage.rows import VerdictRow
 from league.results.ledger import Ledger
 from league.settings import Storage
@@ -97,7 +97,7 @@ def test_each_change_of_the_evidence_is_reported(registry: Registry, name: str) 
     row = verdicts(registry)[0]
     assert row.outcome == "promote"
     with registry.database.write() as session:
-        stored = session.get_one(tables.VerdictTable, row.id)
+        stored = session.get_one(rows.VerdictRow, row.id)
         stored.evidence = {**stored.evidence, name: CHANGES[name]}  # type: ignore[dict-item]
     with pytest.raises(VerdictRefuted, match=f"{name} is .*but the games give"):
         verify(row.id, registry=registry)

@@ -26,7 +26,9 @@ def registry(tmp_path: Path) -> Registry:
     for league, run, settings in ((LEAGUE, FIRST, SETTINGS), (LEAGUE, SECOND, other), ("another", FIRST, SETTINGS)):
         registry.runs.begin(league, run, algorithm="ppo", settings=settings, seed=1, target=9000)
         at = registry.runs.get(league, run).began_at
-        registry.runs.record(league, run, RunPoint(6000, {"return": 0.5, f"loss of {run}": 2.0}, at), seconds=3.0)
+        registry.runs.record(
+            league, run, RunPoint(league, run, 6000, {"return": 0.5, f"loss of {run}": 2.0}, at), seconds=3.0
+        )
     for run in (FIRST, SECOND):
         publish(registry, f"{run}/6000")
     return registry

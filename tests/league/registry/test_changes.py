@@ -34,7 +34,9 @@ CHANGES: list[Callable[[Registry], object]] = [
     lambda registry: registry.evaluations.heartbeat(1, "runner", {"what": "two", "played": 1, "of": 4}),
     lambda registry: registry.evaluations.finish(1, "runner", "done", result={}),
     begin_run,
-    lambda registry: registry.runs.record(LEAGUE, "first", RunPoint(3, {"return": 0.5}, datetime.now(UTC))),
+    lambda registry: registry.runs.record(
+        LEAGUE, "first", RunPoint(LEAGUE, "first", 3, {"return": 0.5}, datetime.now(UTC))
+    ),
     lambda registry: registry.runs.end(LEAGUE, "first", "ended"),
     lambda registry: registry.snapshots.put(LEAGUE, {"summary": {}}, mark="a"),
 ]

@@ -12,7 +12,6 @@ from league.registry.evaluations import HEARTBEAT_TIMEOUT, MAX_ATTEMPTS
 from league.registry.registry import Registry
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import EvaluationRow
-from league.registry.storage.tables import EvaluationTable
 from tests.support.leagues.registries import LEAGUE
 
 REQUEST = {"kind": "tournament", "blocks": 4}
@@ -26,7 +25,7 @@ def expire_heartbeats(registry: Registry) -> None:
     """Let all heartbeats expire."""
     with registry.database.write() as session:
         session.execute(
-            update(EvaluationTable).values(heartbeat_at=datetime.now(UTC) - HEARTBEAT_TIMEOUT - timedelta(seconds=1))
+            update(EvaluationRow).values(heartbeat_at=datetime.now(UTC) - HEARTBEAT_TIMEOUT - timedelta(seconds=1))
         )
 
 

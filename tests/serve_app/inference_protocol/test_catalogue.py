@@ -1,11 +1,12 @@
 """Statistics of several replicas."""
 
 from contextlib import ExitStack
+from dataclasses import fields
 
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from league.registry.storage.tables import LeagueTable
+from league.registry.storage.rows import LeagueRow
 from league.settings import Storage
 from serve_app.app import Replica
 from tests.support.servers.replicas import READ_ONLY, local_client
@@ -29,10 +30,10 @@ def test_a_league_of_another_release_is_left_out_of_the_index(leagues: Storage) 
         before = replica.post("/v2/repository/index").json()
         for name, interface in (("configured", None), ("described", {"of": "another release"})):
             with registry.database.write() as session:
-                row = session.get_one(LeagueTable, "board")
-                values = {column.key: getattr(row, column.key) for column in LeagueTable.__table__.columns}
-                values |= {"slug": name, "config": {"of": "another release"}}
-                session.add(LeagueTable(**values | ({} if interface is None else {"interface": interface})))
+                row = session.get_one(LeagueRow, "board")
+                values = {field.name: getattr(row, field.name) for field in fields(row)}
+                values |= {"slug": name, "config_document": {"of": "another release"}}
+                session.add(LeagueRow(**values | ({} if interface is None else {"interface_document": interface})))
         try:
             assert replica.post("/v2/repository/index").json() == before
             assert registry.leagues.action_selections().keys() >= {"board", "configured", "described"}, "replicas go on"

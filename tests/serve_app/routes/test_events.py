@@ -11,8 +11,7 @@ from jsonschema import Draft202012Validator
 
 from league.registry.changes import ChangeRepository
 from league.registry.registry import Registry
-from league.registry.storage.rows import ChangeToken
-from league.registry.storage.tables import EvaluationTable
+from league.registry.storage.rows import ChangeToken, EvaluationRow
 from serve_app.app import Replica
 from serve_app.openapi.document import document
 from serve_app.routes import events
@@ -130,7 +129,7 @@ def test_a_state_that_cannot_be_sent_is_an_error_and_ends_its_streams_only(
     path = f"/v1/leagues/board/evaluations/{number}/events"
     with listen(server, path) as evaluation, listen(server) as board:
         with registry.database.write() as session:
-            session.get_one(EvaluationTable, number).request = {"kind": "tournament", "games": 2**70}
+            session.get_one(EvaluationRow, number).request = {"kind": "tournament", "games": 2**70}
         until(lambda: evaluation.is_over)
         with listen(server, path) as again:
             assert again.reply.status_code == 500

@@ -61,7 +61,7 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
         )
         for number in range(20):
             record(registry, 1000 * (number + 1))
-        registry.strength.record(LEAGUE, RUN, map(strength, (1, 2, 3)))
+        registry.strength.record(list(map(strength, (1, 2, 3))))
         nights(registry)
         compute(registry)
         yield registry
@@ -79,7 +79,18 @@ def change_game(registry: Registry) -> None:
 def strength(number: int) -> StrengthRow:
     """The score of a version of the run."""
     score = 0.4 + number / 10
-    return StrengthRow(number, 6000 * number, "script:random", 200, score, score - 0.1, score + 0.1, datetime.now(UTC))
+    return StrengthRow(
+        league=LEAGUE,
+        version=number,
+        opponent="script:random",
+        run=RUN,
+        steps=6000 * number,
+        games=200,
+        score=score,
+        low=score - 0.1,
+        high=score + 0.1,
+        at=datetime.now(UTC),
+    )
 
 
 def nights(registry: Registry) -> None:
@@ -108,7 +119,7 @@ def record(registry: Registry, steps: int) -> None:
     """Record progress of the run."""
     curves = {"player/return": steps / 40_000, "player/entropy": 2 - steps / 40_000, "time/sampling": 1.5}
     curves |= {f"opponents/{LEAGUE}@1/share": 0.3, f"opponents/{LEAGUE}@1/score": 0.4 + steps / 100_000}
-    registry.runs.record(LEAGUE, RUN, RunPoint(steps, curves, datetime.now(UTC)), seconds=0.0225 * steps)
+    registry.runs.record(LEAGUE, RUN, RunPoint(LEAGUE, RUN, steps, curves, datetime.now(UTC)), seconds=0.0225 * steps)
 
 
 def verdict_between_versions(registry: Registry) -> VerdictRow:

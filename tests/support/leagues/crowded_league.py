@@ -29,7 +29,7 @@ from evaluation.service.snapshots import refresh
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
-from league.registry.storage import tables
+from league.registry.storage import rows, tables
 from league.registry.storage.database import insert
 from league.registry.storage.manifest import Manifest
 from league.registry.storage.rows import RunState
@@ -153,11 +153,9 @@ class _Crowd:
         """Set the dates of a verdict and its promotion to that night."""
         opened, closed = self._evening(night) + timedelta(hours=1), self._evening(night) + timedelta(hours=2)
         with self._registry.database.write() as session:
-            of_verdict = tables.VerdictTable.id == verdict
-            session.execute(update(tables.VerdictTable).where(of_verdict).values(opened_at=opened, closed_at=closed))
-            session.execute(
-                update(tables.AliasEventTable).where(tables.AliasEventTable.verdict == verdict).values(at=closed)
-            )
+            of_verdict = rows.VerdictRow.id == verdict
+            session.execute(update(rows.VerdictRow).where(of_verdict).values(opened_at=opened, closed_at=closed))
+            session.execute(update(rows.AliasEvent).where(rows.AliasEvent.verdict == verdict).values(at=closed))
 
     def _evening(self, night: int) -> datetime:
         return self._began + timedelta(days=night - 1)
@@ -187,8 +185,8 @@ class _Crowd:
         ]
         newest = {"steps": points[-1]["steps"], "curves": points[-1]["curves"], "seconds": 10.0 * RUN_POINTS}
         with self._registry.database.write() as session:
-            insert(session, tables.RunPointTable, points)
-            session.execute(update(tables.RunTable).where(tables.RunTable.id == name).values(began_at=began, **newest))
+            insert(session, rows.RunPoint, points)
+            session.execute(update(rows.RunRow).where(rows.RunRow.id == name).values(began_at=began, **newest))
         if state != "running":
             self._registry.runs.end(LEAGUE, name, state, "the power was cut" if state == "failed" else None)
 

@@ -14,7 +14,18 @@ LEAGUE = "board"
 WON, LOST, PENDING = "board-verdict-won", "board-verdict-lost", "board-verdict-pending"
 EARLIER = "0123456789ab-greedy"
 """Earlier conditions with results."""
-STRENGTH = StrengthRow(2, 200, "board@1", 40, 0.625, 0.5, 0.75, datetime(2026, 3, 3, 14, tzinfo=UTC))
+STRENGTH = StrengthRow(
+    league=LEAGUE,
+    version=2,
+    opponent="board@1",
+    run="first",
+    steps=200,
+    games=40,
+    score=0.625,
+    low=0.5,
+    high=0.75,
+    at=datetime(2026, 3, 3, 14, tzinfo=UTC),
+)
 GAIN = {"mean": 1.5, "low": 0.5, "high": 2.5}
 EXPLOITER_SCORE = {"ref": "board@3", "games": 64, "score": 0.75, "low": 0.625, "high": 0.875, "gain": GAIN}
 NIGHT = {
@@ -99,12 +110,12 @@ def _runs(registry: Registry) -> None:
     for run in ("first", "second"):
         registry.runs.begin(LEAGUE, run, algorithm="ppo", settings={"lr": 0.001}, seed=3, target=1000)
     for steps in (100, 200):
-        point = RunPoint(steps, {"return": steps / 1000, "shared/entropy": 1.5}, datetime.now(UTC))
+        point = RunPoint(LEAGUE, "first", steps, {"return": steps / 1000, "shared/entropy": 1.5}, datetime.now(UTC))
         registry.runs.record(LEAGUE, "first", point, seconds=steps / 10)
     registry.runs.end(LEAGUE, "first", "failed", "the environment raised")
     registry.runs.begin(LEAGUE, "exploiter", algorithm="ppo", settings={}, seed=3, target=1000, exploits="board@2")
     registry.runs.end(LEAGUE, "exploiter", "ended")
-    registry.strength.record(LEAGUE, "first", [STRENGTH])
+    registry.strength.record([STRENGTH])
 
 
 def _nights(registry: Registry) -> None:

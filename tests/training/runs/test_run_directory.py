@@ -12,8 +12,7 @@ from sqlalchemy import update
 from league.errors import AlreadyRunning, ConfigError, NotFound, RunCorrupt
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER
-from league.registry.storage.tables import RunTable
-from league.registry.training.runs import HEARTBEAT_TIMEOUT
+from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunRow
 from league.settings import Storage
 from tests.support.leagues.registries import interface
 from tests.support.leagues.training_leagues import tictactoe
@@ -51,7 +50,7 @@ def start(registry: Registry, run: RunDirectory) -> None:
 
 def change(registry: Registry, run: RunDirectory, **columns: object) -> None:
     with registry.database.write() as session:
-        session.execute(update(RunTable).filter_by(id=run.id).values(**columns))
+        session.execute(update(RunRow).filter_by(id=run.id).values(**columns))
 
 
 def test_the_latest_run_is_resumed(registry: Registry, storage: Storage) -> None:
@@ -168,7 +167,7 @@ def test_a_run_is_trained_on_one_machine_at_a_time(
     monkeypatch.setattr(run_directory, "POLL", 0.01)
     run = RunDirectory.begin(registry.storage, tictactoe(), None, None)
     start(registry, run)
-    change(registry, run, state="running", driver="trainer-7/boot/1:10:20")
+    change(registry, run, reported_state="running", driver="trainer-7/boot/1:10:20")
     is_over = threading.Event()
 
     def send_heartbeats() -> None:
@@ -193,7 +192,7 @@ def test_a_run_continues_when_the_machine_that_trained_it_is_silent(
     run = RunDirectory.begin(registry.storage, tictactoe(), None, None)
     start(registry, run)
     almost_silent = datetime.now(UTC) - HEARTBEAT_TIMEOUT + timedelta(seconds=3)
-    change(registry, run, state="running", driver="trainer-7/boot/1:10:20", heartbeat_at=almost_silent)
+    change(registry, run, reported_state="running", driver="trainer-7/boot/1:10:20", heartbeat_at=almost_silent)
     assert RunDirectory.resume(elsewhere, tictactoe()).id == run.id
     assert datetime.now(UTC) > almost_silent + HEARTBEAT_TIMEOUT
     assert f"{run.id} was running on trainer-7; waiting for up to 60 s" in caplog.text
@@ -203,7 +202,7 @@ def test_a_run_that_ended_on_another_machine_is_complete(registry: Registry) -> 
     """The record on this machine is from before it continued there."""
     run = RunDirectory.begin(registry.storage, tictactoe(steps=10), None, None)
     start(registry, run)
-    change(registry, run, state="ended", driver="trainer-7/boot/1:10:20")
+    change(registry, run, reported_state="ended", driver="trainer-7/boot/1:10:20")
     with pytest.raises(NotFound, match="is complete"):
         RunDirectory.resume(registry, tictactoe(steps=10))
     assert RunDirectory.find(registry, tictactoe(), run.id).record.complete

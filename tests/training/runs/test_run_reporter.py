@@ -9,8 +9,8 @@ import pytest
 
 from league.errors import ParityError
 from league.registry.registry import Registry
+from league.registry.storage import rows
 from league.registry.storage.rows import RunRow
-from league.registry.training import runs
 from league.settings import Storage
 from tests.support.leagues.registries import interface
 from tests.support.leagues.training_leagues import tictactoe
@@ -162,7 +162,7 @@ def test_a_resumed_run_keeps_its_record(registry: Registry, run: RunDirectory) -
 def test_heartbeats_continue_without_new_reports(
     registry: Registry, run: RunDirectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert runs.HEARTBEAT_TIMEOUT.total_seconds() > 3 * run_reporter.HEARTBEAT_SECONDS
+    assert rows.HEARTBEAT_TIMEOUT.total_seconds() > 3 * run_reporter.HEARTBEAT_SECONDS
     monkeypatch.setattr(run_reporter, "HEARTBEAT_SECONDS", 0.01)
     with RunReporter(registry, run) as reporter:
         reporter.begin(0, 0.0)

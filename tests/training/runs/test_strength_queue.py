@@ -51,7 +51,20 @@ class Run:
         if version.number == 2:
             raise GameHung("a game did not end")
         now = datetime.now(UTC)
-        return [StrengthRow(version.number, 100 * version.number, "script:random", games, 0.75, 0.5, 0.875, now)]
+        return [
+            StrengthRow(
+                league=version.league,
+                version=version.number,
+                opponent="script:random",
+                run=version.run,
+                steps=100 * version.number,
+                games=games,
+                score=0.75,
+                low=0.5,
+                high=0.875,
+                at=now,
+            )
+        ]
 
     def recorded(self) -> list[tuple[int, str]]:
         return [(row.version, row.opponent) for row in self.registry.strength.of_run(LEAGUE, self.directory.id)]

@@ -2,11 +2,11 @@
 
 from alembic import context
 
-from league.registry.storage.tables import Base
+from league.registry.storage import rows
 
 context.configure(
     connection=context.config.attributes["connection"],
-    target_metadata=Base.metadata,
+    target_metadata=rows.Record.metadata,
     render_as_batch=True,
 )
 context.run_migrations()

@@ -44,12 +44,25 @@ def used(registry: Registry) -> Registry:
     registry.verdicts.close(VERDICT, "promote", {"promoted": True})
     registry.versions.set_note(CheckpointRef(LEAGUE, 3), "strong", actor="me")
     registry.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=0, target=10, parent=1)
-    registry.runs.record(LEAGUE, "run", RunPoint(5, {"return": 1.0}, registry.runs.get(LEAGUE, "run").began_at))
+    registry.runs.record(
+        LEAGUE, "run", RunPoint(LEAGUE, "run", 5, {"return": 1.0}, registry.runs.get(LEAGUE, "run").began_at)
+    )
     registry.runs.end(LEAGUE, "run", "ended")
     for version, opponent in ((1, "script:random"), (2, f"{LEAGUE}@3"), (3, "script:random")):
         at = registry.versions.get(LEAGUE, version).created_at
-        score = StrengthRow(version=version, opponent=opponent, steps=5, games=8, score=0.5, low=0.3, high=0.7, at=at)
-        registry.strength.record(LEAGUE, "run", [score])
+        score = StrengthRow(
+            league=LEAGUE,
+            run="run",
+            version=version,
+            opponent=opponent,
+            steps=5,
+            games=8,
+            score=0.5,
+            low=0.3,
+            high=0.7,
+            at=at,
+        )
+        registry.strength.record([score])
     registry.nightly_runs.close(registry.nightly_runs.open(LEAGUE, [3], 0.05).id, {})
     registry.training_nights.open(LEAGUE)
     registry.traffic.set(LEAGUE, shadow=Portion(1, 0.5), actor="me", reason="")

@@ -8,10 +8,8 @@ from sqlalchemy import update
 
 from league.errors import InvalidInput, UnknownLeague, UnknownRun
 from league.registry.registry import Registry
-from league.registry.storage.rows import RunPoint, RunRow
-from league.registry.storage.tables import RunTable
+from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunPoint, RunRow
 from league.registry.training import runs
-from league.registry.training.runs import HEARTBEAT_TIMEOUT
 from tests.support.leagues.registries import LEAGUE
 
 SETTINGS = {"algorithm": "ppo", "lr": 3e-4}
@@ -24,7 +22,7 @@ def begin(registry: Registry, run: str = "first", steps: int = 0, parent: int | 
 
 
 def record(registry: Registry, steps: int, run: str = "first", **curves: float) -> None:
-    point = RunPoint(steps, curves or {"return": steps / 10}, datetime.now(UTC))
+    point = RunPoint(LEAGUE, run, steps, curves or {"return": steps / 10}, datetime.now(UTC))
     registry.runs.record(LEAGUE, run, point, seconds=steps / 100)
 
 
@@ -35,7 +33,7 @@ def steps_of(registry: Registry, run: str = "first") -> list[int]:
 def expire_heartbeats(registry: Registry) -> None:
     with registry.database.write() as session:
         session.execute(
-            update(RunTable).values(heartbeat_at=datetime.now(UTC) - HEARTBEAT_TIMEOUT - timedelta(seconds=1))
+            update(RunRow).values(heartbeat_at=datetime.now(UTC) - HEARTBEAT_TIMEOUT - timedelta(seconds=1))
         )
 
 

@@ -197,6 +197,7 @@ def upgrade() -> None:
     op.create_table(
         "training_nights",
         sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("number", sa.Integer(), nullable=False),
         sa.Column("league", sa.String(length=255), nullable=False),
         sa.Column("parent", sa.Integer(), nullable=True),
         sa.Column("steps", sa.JSON(), nullable=False),
