@@ -1,15 +1,21 @@
-"""Python subprocesses that end with their parent: start, wait, deadline, stop and reap."""
+"""Python subprocesses that end with their parent: start, deadline, stop and reap; requests and responses over pipes."""
 
 from __future__ import annotations
 
+import json
 import os
+import queue
 import subprocess
 import sys
 import threading
+import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from types import MappingProxyType
-from typing import IO
+from typing import IO, Any
+
+from league.errors import LeagueError, WorkerLost, from_document, to_document
 
 POLL_INTERVAL = 0.1
 """Seconds between two checks whether a subprocess has exited."""
@@ -26,7 +32,7 @@ class Subprocess:
     def __init__(
         self,
         module: str,
-        argument: str,
+        argument: str = "",
         environment: Mapping[str, str] = MappingProxyType({}),
         *,
         output: bool = False,
@@ -79,8 +85,11 @@ class Subprocess:
             pass
 
     @contextmanager
-    def deadline(self, seconds: float) -> Iterator[None]:
-        """Kill it if the block takes longer than `seconds`. Reads from its pipes then return."""
+    def deadline(self, seconds: float | None) -> Iterator[None]:
+        """Kill it if the block takes longer than `seconds`, if given. Reads from its pipes then return."""
+        if seconds is None:
+            yield
+            return
         timer = threading.Timer(seconds, self.kill)
         timer.start()
         try:
@@ -111,6 +120,131 @@ class Subprocess:
                 with suppress(BrokenPipeError):  # input that it did not read
                     pipe.close()
         return code
+
+
+class RequestProcess:
+    """A subprocess that answers requests, see `answer_requests`.
+
+    It starts with the first request, and again with the next one after it has died. One request at a time; another
+    thread may call `close`.
+    """
+
+    def __init__(
+        self,
+        module: str,
+        argument: str = "",
+        environment: Mapping[str, str] = MappingProxyType({}),
+        *,
+        work: str,
+        start_timeout: float | None = None,
+    ) -> None:
+        """Describe it; see `Subprocess`.
+
+        Args:
+            module: The module.
+            argument: Its argument.
+            environment: Environment variables besides those of this process.
+            work: What it does, for messages: `plays games`.
+            start_timeout: Seconds within which it must be ready; None for no limit.
+        """
+        self._command = module, argument, environment
+        self._work, self._start_timeout = work, start_timeout
+        self._process: Subprocess | None = None
+        self._is_closed = False
+        self._lock = threading.Lock()
+
+    @property
+    def pid(self) -> int | None:
+        """Its process id; None before it starts, and after it has died in a request."""
+        process = self._process
+        return None if process is None else process.pid
+
+    def request(self, line: str, timeout: float | None = None) -> tuple[dict[str, Any], bytes]:
+        """Send a request and return its response: a document and further bytes.
+
+        Args:
+            line: The request, without line breaks.
+            timeout: Seconds until the process is killed; None for no limit.
+
+        Raises:
+            LeagueError: The error that the process reports.
+            TimeoutError: The process was killed after `timeout`.
+            WorkerLost: It died or was closed.
+            OSError: It cannot be started.
+        """
+        with self._lock:
+            if self._is_closed:
+                raise WorkerLost(f"the process that {self._work} was ended")
+            is_new = self._process is None
+            process = self._process = self._process or Subprocess(*self._command, output=True)
+        began = time.monotonic()
+        try:
+            if is_new:
+                with process.deadline(self._start_timeout):
+                    json.loads(process.stdout.readline())
+                began = time.monotonic()
+            with process.deadline(timeout):
+                process.stdin.write(line.encode() + b"\n")
+                process.stdin.flush()
+                head: dict[str, Any] = json.loads(process.stdout.readline())
+                content = process.stdout.read(head["size"])
+            if len(content) < head["size"]:
+                raise ValueError("the response is truncated")
+        except (OSError, ValueError) as error:
+            self._stop()
+            if timeout is not None and time.monotonic() - began >= timeout:
+                raise TimeoutError from error
+            raise WorkerLost(f"the process that {self._work} died: see its messages") from error
+        if "code" in head:
+            raise from_document(head)
+        return head, content
+
+    def close(self) -> None:
+        """Kill it, also during a request."""
+        with self._lock:
+            self._is_closed = True
+        self._stop()
+
+    def _stop(self) -> None:
+        with self._lock:
+            process, self._process = self._process, None
+        if process is not None:
+            process.stop()
+
+
+def answer_requests(respond: Callable[[bytes], tuple[Mapping[str, Any], bytes]]) -> None:
+    """Answer the requests of a `RequestProcess` in this subprocess until the parent ends, also during a response.
+
+    It writes `{}` when it is ready. Each line of standard input is a request. Responses follow in order: a JSON object
+    in a line, with `size`, and so many bytes.
+
+    respond: returns the object and the bytes. A LeagueError is a response, too; other exceptions are bugs, which end
+    the process.
+    """
+    requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in sys.stdin.buffer:
+            requests.put(line)
+        os._exit(0)
+
+    responses = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # output of environments must not mix with responses
+    threading.Thread(target=read, name="requests", daemon=True).start()
+    head: Mapping[str, Any] = {}
+    content = b""
+    try:
+        while True:
+            responses.write(json.dumps(head).encode() + b"\n" + content)
+            responses.flush()
+            try:
+                head, content = respond(requests.get())
+            except LeagueError as error:
+                head, content = to_document(error), b""
+            head = {**head, "size": len(content)}
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)  # an exit would wait for the lock of standard input, which the other thread holds
 
 
 def exit_with_parent(cleanup: Callable[[], None] = lambda: None) -> None:

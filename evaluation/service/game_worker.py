@@ -2,9 +2,8 @@
 
     python -m evaluation.service.game_worker '{"league": "connect_four", "seconds": 60}'
 
-It writes `{}` to standard output when it is ready. Each line of standard input is a GameRequest in JSON. Responses
-follow in order: a JSON line `{"media_type", "size"}` and `size` bytes, or `{"code", "message"}`. The process exits at
-the end of its input.
+Requests are GameRequests in JSON. A response has the `media_type` of its content; see
+`league.subprocesses.answer_requests`.
 
 It is a separate process because an environment is third-party code: it may hang, crash the interpreter or require the
 main thread for rendering, and a deadline can interrupt the main thread only.
@@ -13,14 +12,12 @@ main thread for rendering, and a deadline can interrupt the main thread only.
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import BinaryIO
 
 import orjson
 from pydantic import BaseModel
@@ -34,7 +31,7 @@ from evaluation.playback.replay import recorded_game
 from evaluation.playback.video import write_video
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
-from league.errors import GameCrashed, GameHung, LeagueError, one_line, to_document
+from league.errors import GameCrashed, GameHung, LeagueError, one_line
 from league.policies.loading import acting_ref
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -48,7 +45,7 @@ from league.service_requests import (
     VideoRequest,
 )
 from league.settings import Storage
-from league.subprocesses import INTERACTIVE, lower_priority
+from league.subprocesses import INTERACTIVE, answer_requests, lower_priority
 
 
 class GameWorker:
@@ -131,23 +128,6 @@ class GameWorker:
             raise
 
 
-def serve_requests(worker: GameWorker, requests: BinaryIO, responses: BinaryIO, seconds: float) -> None:
-    """Respond to requests until the end of the input. seconds: time limit of one request.
-
-    Exceptions other than LeagueError are bugs: they end the process and are logged.
-    """
-    for line in requests:
-        content = b""
-        try:
-            response = _within(worker, GameRequest.model_validate_json(line), seconds)
-            head: Mapping[str, str | int] = {"media_type": response.media_type, "size": len(response.content)}
-            content = response.content
-        except LeagueError as error:
-            head = to_document(error)
-        responses.write(json.dumps(head).encode() + b"\n" + content)
-        responses.flush()
-
-
 def _within(worker: GameWorker, request: GameRequest, seconds: float) -> GameResponse:
     end = time.monotonic() + seconds
 
@@ -169,15 +149,17 @@ def _json(document: BaseModel) -> GameResponse:
 
 
 def main() -> None:
-    """Serve requests on standard input and output."""
+    """Respond to the requests of the evaluation service."""
     options = json.loads(sys.argv[1])
     lower_priority(INTERACTIVE)
-    responses = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # output of environments must not mix with responses
     with closing(Registry.open(Storage.from_environment(), create=False)) as registry:
-        responses.write(b"{}\n")
-        responses.flush()
-        serve_requests(GameWorker(options["league"], registry), sys.stdin.buffer, responses, options["seconds"])
+        worker = GameWorker(options["league"], registry)
+
+        def respond(request: bytes) -> tuple[Mapping[str, str], bytes]:
+            response = _within(worker, GameRequest.model_validate_json(request), options["seconds"])
+            return {"media_type": response.media_type}, response.content
+
+        answer_requests(respond)
 
 
 if __name__ == "__main__":

@@ -11,17 +11,12 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from collections import OrderedDict
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
 
-from league.errors import GameHung, NotReady, Overloaded, WorkerLost, from_document
+from league.errors import GameHung, NotReady, Overloaded, WorkerLost
 from league.service_requests import GameRequest, GameResponse
-from league.subprocesses import Subprocess
-
-T = TypeVar("T")
+from league.subprocesses import RequestProcess
 
 SECONDS = 60.0
 """Time limit of one request. A video of several hundred frames takes half of it."""
@@ -111,11 +106,15 @@ class _LeagueWorker:
     """The process of one league and the thread that its requests wait in."""
 
     def __init__(self, league: str, seconds: float, grace: float) -> None:
-        self._league, self._seconds, self._grace = league, seconds, grace
+        self._league, self._timeout = league, seconds + grace
         self._thread = ThreadPoolExecutor(1, f"games-{league}")
         self._pending: list[Future[GameResponse]] = []
-        self._process: Subprocess | None = None
-        self._is_closed = False
+        self._process = RequestProcess(
+            "evaluation.service.game_worker",
+            json.dumps({"league": league, "seconds": seconds}),
+            work=f"plays games of {league}",
+            start_timeout=START_TIMEOUT,
+        )
 
     @property
     def is_busy(self) -> bool:
@@ -132,62 +131,24 @@ class _LeagueWorker:
 
     def close(self) -> None:
         """Kill the process."""
-        self._is_closed = True
         self._thread.shutdown(wait=False, cancel_futures=True)
-        if self._process is not None:
-            self._process.stop()
+        self._process.close()
 
     def _request(self, line: str) -> GameResponse:
-        is_old = self._process is not None
+        is_old = self._process.pid is not None
         try:
-            return self._attempt(line)
-        except WorkerLost:
-            if not is_old:
-                raise
-            return self._attempt(line)  # the process may have died before, for another reason
-
-    def _attempt(self, line: str) -> GameResponse:
-        if self._process is None:
-            options = {"league": self._league, "seconds": self._seconds}
-            self._process = Subprocess("evaluation.service.game_worker", json.dumps(options), output=True)
-            if self._is_closed:
-                self._process.kill()
-            self._within(START_TIMEOUT, self._process, _await_start)
-        return self._within(self._seconds + self._grace, self._process, lambda process: _exchange(process, line))
-
-    def _within(self, seconds: float, process: Subprocess, action: Callable[[Subprocess], T]) -> T:
-        """The result of an action on the process, which is killed if that takes longer or fails."""
-        began = time.monotonic()
-        try:
-            with process.deadline(seconds):
-                return action(process)
-        except (OSError, ValueError) as error:
-            process.stop()
-            self._process = None
-            if time.monotonic() - began >= seconds:
-                raise GameHung(f"a game of {self._league} hung: its process was killed after {seconds:g} s") from error
-            raise WorkerLost(f"the process that plays games of {self._league} died: see its log") from error
-
-
-def _await_start(process: Subprocess) -> None:
-    """Raise ValueError if the process dies before it is ready."""
-    json.loads(process.stdout.readline())
-
-
-def _exchange(process: Subprocess, line: str) -> GameResponse:
-    """Send a request and read its response.
-
-    Raises the LeagueError that the process reports, and OSError or ValueError if it dies.
-    """
-    process.stdin.write(line.encode() + b"\n")
-    process.stdin.flush()
-    head = json.loads(process.stdout.readline())
-    if "code" in head:
-        raise from_document(head)
-    content = process.stdout.read(head["size"])
-    if len(content) < head["size"]:
-        raise ValueError("the response is truncated")
-    return GameResponse(head["media_type"], content)
+            try:
+                head, content = self._process.request(line, self._timeout)
+            except WorkerLost:
+                if not is_old:
+                    raise
+                # The process may have died before, for another reason.
+                head, content = self._process.request(line, self._timeout)
+        except TimeoutError as error:
+            raise GameHung(
+                f"a game of {self._league} hung: its process was killed after {self._timeout:g} s"
+            ) from error
+        return GameResponse(head["media_type"], content)
 
 
 def _size(response: Future[GameResponse]) -> int:

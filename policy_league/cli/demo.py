@@ -61,7 +61,7 @@ def demo(
 
 
 def _train(config: "LeagueConfig", minutes: float) -> None:
-    from evaluation.service.strength_process import strength_process
+    from evaluation.service.strength_process import StrengthProcess
     from training.runs.train import train
 
     _step(1, f"Train for {minutes:g} minutes by masked PPO (RLlib, Ray Tune): self-play, and games against {OPPONENT}.")
@@ -69,7 +69,7 @@ def _train(config: "LeagueConfig", minutes: float) -> None:
     say("Each checkpoint is exported to ONNX, tested for identical actions, and published as a version.")
     paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS, teacher=TEACHER)
     registry = open_registry()
-    with strength_process(registry.storage) as measure:
+    with closing(StrengthProcess(registry.storage)) as measure:
         train(paced, registry=registry, config_path=find(LEAGUE), console=console, measure=measure)
 
 

@@ -1,7 +1,7 @@
 """`league nightly`: gate and promotion of new versions, run by a scheduler."""
 
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any
@@ -246,7 +246,7 @@ def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer
     def train(config: "LeagueConfig", *, name: str, parent: int | None, target: str | None) -> None:
         from rich.console import Console
 
-        from evaluation.service.strength_process import strength_process
+        from evaluation.service.strength_process import StrengthProcess
         from league.refs import CheckpointRef
         from training.runs.parent import start_version
         from training.runs.train import train as run
@@ -256,7 +256,7 @@ def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer
         start = None if parent_ref is None else start_version(registry, parent_ref, config, exploited)
         if start != parent_ref and exploited is None and not quiet:
             say(f"{parent_ref} was imported and cannot be trained further: training starts from {start or 'scratch'}")
-        with games.paused(), strength_process(registry.storage) as measure:
+        with games.paused(), closing(StrengthProcess(registry.storage)) as measure:
             run(
                 config,
                 registry=registry,

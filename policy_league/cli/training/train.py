@@ -2,6 +2,7 @@
 
 import os
 import shlex
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -94,12 +95,12 @@ def train(
         )
         _submit(address, find(config), options, resume, (cpus, object_store, dashboard))
         return
-    from evaluation.service.strength_process import strength_process
+    from evaluation.service.strength_process import StrengthProcess
     from league.ray_cluster import LocalRay
     from training.runs.train import train as run
 
     registry = open_registry()
-    with exit_on_interrupt(), strength_process(registry.storage) as measure:
+    with exit_on_interrupt(), closing(StrengthProcess(registry.storage)) as measure:
         published = run(
             league,
             registry=registry,

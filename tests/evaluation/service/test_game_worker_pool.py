@@ -19,6 +19,7 @@ from PIL import Image
 from evaluation.matches.tournament import evaluate
 from evaluation.service import game_worker_pool
 from evaluation.service.game_worker_pool import GameWorkerPool
+from league import subprocesses
 from league.environments.building import interface
 from league.errors import (
     EnvironmentMismatch,
@@ -143,7 +144,7 @@ def test_a_process_that_cannot_be_started_is_tried_again(registry: Registry, mon
 
     with running() as pool:
         with monkeypatch.context() as patched:
-            patched.setattr(game_worker_pool, "Subprocess", fail)
+            patched.setattr(subprocesses, "Subprocess", fail)
             with pytest.raises(OSError, match="no more processes"):
                 submit(pool, PlayabilityRequest())
         assert document_of(submit(pool, PlayabilityRequest()))["playable"] is True

@@ -3,15 +3,16 @@
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from evaluation.matches.worker import MatchWorker
-from evaluation.service.strength_process import StrengthProcess, strength_process
-from evaluation.service.strength_worker import respond
-from league.errors import UnknownVersion, WorkerLost
+from evaluation.service.strength_process import StrengthProcess
+from evaluation.service.strength_worker import measured
+from league.errors import LeagueError, UnknownVersion, WorkerLost
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from tests.support.leagues import tictactoe
@@ -30,12 +31,13 @@ def version(registry: Registry) -> VersionRow:
 
 
 def process_id(measure: StrengthProcess) -> int:
-    assert measure._process is not None
-    return measure._process.pid
+    pid = measure._process.pid
+    assert pid is not None
+    return pid
 
 
 def test_a_process_plays_reports_errors_and_is_replaced(registry: Registry, version: VersionRow) -> None:
-    with strength_process(registry.storage) as measure:
+    with closing(StrengthProcess(registry.storage)) as measure:
         (row,) = measure(version, 4)
         assert (row.version, row.opponent, row.games) == (1, "script:random", 4)
         first = process_id(measure)
@@ -56,5 +58,5 @@ def test_an_exception_of_a_policy_is_a_response(registry: Registry, version: Ver
             raise RuntimeError("no such layer")
 
     worker = Broken(registry.leagues.get(tictactoe.LEAGUE).config, registry)
-    found = respond(registry, worker, {"version": version.number, "games": 4})
-    assert found == {"code": "league_error", "message": "RuntimeError: no such layer"}
+    with pytest.raises(LeagueError, match=r"^RuntimeError: no such layer$"):
+        measured(registry, worker, version.number, 4)
