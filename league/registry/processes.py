@@ -17,8 +17,16 @@ def is_local(process: str) -> bool:
 
 def has_ended(process: str) -> bool:
     """Return whether a process ran on this machine and has ended. False for those of other machines."""
+    if not is_local(process):
+        return False
     _, pid, start = process.rsplit(":", 2)
-    return is_local(process) and not (_exists(int(pid)) and _start(int(pid)) == start)
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        pass  # of another user
+    return _start(int(pid)) != start
 
 
 def host_name(process: str) -> str:
@@ -36,16 +44,6 @@ def this_machine() -> str:
     except OSError:
         return socket.gethostname()
     return f"{socket.gethostname()}/{boot}/{container}"
-
-
-def _exists(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def _start(pid: int) -> str:

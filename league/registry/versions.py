@@ -234,35 +234,32 @@ def _unknown(session: Session, league: str, number: int) -> VersionRow:
     raise UnknownVersion(f"league {league} has no version {number}; {newest}")
 
 
-def _notes(session: Session, league: str, versions: Collection[int]) -> dict[int, Note]:
-    """Return version → its newest note, without empty ones."""
-    if not versions:
-        return {}
-    table = VersionNoteTable
-    of_versions = (table.league == league) & table.version.between(min(versions), max(versions))
-    newest = select(func.max(table.id)).where(of_versions).group_by(table.version)
-    notes = session.scalars(select(table).where(table.id.in_(newest), table.text != ""))
-    return {note.version: Note(note.text, note.actor, note.at) for note in notes}
-
-
 def _rows(session: Session, league: str, versions: list[VersionTable]) -> list[VersionRow]:
+    if not versions:
+        return []
     names: dict[int, list[str]] = {}
     for alias in session.scalars(select(AliasTable).filter_by(league=league).order_by(AliasTable.name)):
         names.setdefault(alias.version, []).append(alias.name)
-    notes = _notes(session, league, [version.number for version in versions])
-    return [_row(version, tuple(names.get(version.number, ())), notes.get(version.number)) for version in versions]
-
-
-def _row(version: VersionTable, aliases: tuple[str, ...], note: Note | None) -> VersionRow:
-    assert version.manifest is not None, "a ready version has a manifest"
-    assert version.sha256 is not None, "a ready version has a digest"
-    return VersionRow(
-        league=version.league,
-        number=version.number,
-        source=version.source,
-        sha256=version.sha256,
-        manifest=Manifest.from_json(version.manifest, source=f"the manifest of {version.league}@{version.number}"),
-        aliases=aliases,
-        note=note,
-        retired_at=version.retired_at,
-    )
+    numbers, table = [version.number for version in versions], VersionNoteTable
+    of_versions = (table.league == league) & table.version.between(min(numbers), max(numbers))
+    newest = select(func.max(table.id)).where(of_versions).group_by(table.version)
+    stored_notes = session.scalars(select(table).where(table.id.in_(newest), table.text != ""))
+    notes = {note.version: Note(note.text, note.actor, note.at) for note in stored_notes}
+    rows = []
+    for version in versions:
+        assert version.manifest is not None, "a ready version has a manifest"
+        assert version.sha256 is not None, "a ready version has a digest"
+        manifest = Manifest.from_json(version.manifest, source=f"the manifest of {league}@{version.number}")
+        rows.append(
+            VersionRow(
+                league=league,
+                number=version.number,
+                source=version.source,
+                sha256=version.sha256,
+                manifest=manifest,
+                aliases=tuple(names.get(version.number, ())),
+                note=notes.get(version.number),
+                retired_at=version.retired_at,
+            )
+        )
+    return rows

@@ -176,9 +176,13 @@ class Database:
         Raises DeadlineExceeded, and changes nothing, if that of `before` passes.
         """
         deadline = _deadline.get()
+        connection: Connection | None = getattr(self._of_thread, "connection", None)
+        if connection is not None and connection.invalidated:
+            # SQLAlchemy would connect again, without the locks of the session.
+            raise StorageError("the connection to the database was lost, and with it a lock that this work requires")
         with (
             translate_errors(self.engine),
-            Session(self._write_through(), expire_on_commit=False) as session,
+            Session(connection or self._writing, expire_on_commit=False) as session,
             session.begin(),
         ):
             if deadline is not None and self.engine.dialect.name == "postgresql":
@@ -213,13 +217,6 @@ class Database:
             yield
         finally:
             self._of_thread.connection = previous
-
-    def _write_through(self) -> Engine | Connection:
-        connection: Connection | None = getattr(self._of_thread, "connection", None)
-        if connection is not None and connection.invalidated:
-            # SQLAlchemy would connect again, without the locks of the session.
-            raise StorageError("the connection to the database was lost, and with it a lock that this work requires")
-        return connection or self._writing
 
     def close_unused(self) -> None:
         """Close pooled connections to PostgreSQL, each a process there, if none was used since the last call."""
