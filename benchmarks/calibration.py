@@ -20,11 +20,11 @@ from benchmarks.simulations.shuffled_order import verdicts_of_shuffled_completio
 from benchmarks.simulations.simulated_gates import CELLS, EQUALS, simulate, stronger
 from benchmarks.simulations.simulated_years import boundary, chance, walk
 from evaluation.gating.gate import Decision, decide
-from evaluation.gating.gate_result import AnchorResult, combine_results
+from evaluation.gating.gate_result import GateResult
 from evaluation.statistics.alpha_spending import NIGHTS, alpha_per_verdict
 from evaluation.statistics.sequential import expected_games
 from league.config.gate import GateConfig
-from league.verdict_tests import AnchorTest
+from tests.support.gate_results import decided
 from tests.support.leagues import tictactoe
 
 CANDIDATES = 8
@@ -79,9 +79,7 @@ def traps(quick: bool) -> Iterator[Target]:
     for _ in range(number):
         champion = _decided(settings, against_champion, rng)
         anchor = _decided(settings.against_anchor(settings.margin), against_anchor, rng)
-        result = combine_results(
-            champion, [AnchorResult(AnchorTest("trap@1", margin, "s"), anchor)], planned_companions=1, forfeits=0
-        )
+        result = GateResult(settings, decided(champion), (decided(anchor),), planned=1, forfeits=0)
         beaten += champion.outcome == "promote"
         promoted += result.outcome == "promote"
     yield Target("non-transitive candidates promoted", promoted, f"of {number}", at_most=0)

@@ -35,7 +35,6 @@ from league.config.league import LeagueConfig
 from league.policies.loading import eligible, load
 from league.registry.registry import Registry
 from league.settings import Storage
-from policy_league.cli.output import difference
 from policy_league.configs.bundled import find
 
 NIGHTS, MINUTES = 10, 3.0
@@ -166,6 +165,6 @@ def _strength(league: str, home: Path, last: str, first: str, compared: str) -> 
         score, low, high = score_interval([match.score(0) for match in matches])
         note = f"[{low:.1%}, {high:.1%}]"
         if compared == "gain" and (gain := paired_difference(matches, last)) is not None:
-            note += f", gain {difference(gain)} per game"
+            note += f", gain {gain} per game"
     name = f"{league}, score of the last champion"
     yield Target(name, round(100 * score, 1), "%", at_least=SCORE, peer="the first", note=note)

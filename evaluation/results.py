@@ -1,4 +1,4 @@
-"""Results of evaluations and nightly runs as plain records; `to_json()` returns a JSON document without NaN."""
+"""Results of evaluations as plain records; `to_json()` returns a JSON document without NaN."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 from league.conditions import ActionSelection
 from league.results.records import Scoring
-from league.verdict_tests import AnchorMode
 
 
 class Document:
@@ -76,6 +75,11 @@ class Difference(Document):
     mean: float
     low: float | None
     high: float | None
+
+    def __str__(self) -> str:
+        """`+1.5 [0.9, 2.1]`"""
+        span = "" if self.low is None or self.high is None else f" [{self.low:.4g}, {self.high:.4g}]"
+        return f"{self.mean:+.4g}{span}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,163 +223,6 @@ class EvaluationReport(Document):
 
 
 @dataclass(frozen=True, slots=True)
-class CompanionReport(Document):
-    """A test of a verdict after that against the champion, with its evidence as in VerdictReport.
-
-    ref: the other contestant. margin: by how much the candidate may be worse. schedule: of the matches that count.
-    outcome: passed, failed, `inconclusive`, or `open` if the verdict was voided before its end.
-    """
-
-    ref: str
-    margin: float
-    schedule: str
-    outcome: str
-    llr: float
-    bounds: tuple[float, float]
-    blocks: int
-    games: int
-    unique_games: int
-    counts: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class AnchorReport(CompanionReport):
-    """One test against an anchor.
-
-    mode: `at_least`: the margin is in the gate's unit, and the outcome `not inferior` or `inferior`. `no_worse`: all
-    other fields are those of an ExploiterReport, and there is no Elo.
-    """
-
-    score: float | None
-    elo: float | None
-    interval: tuple[float | None, float | None] | None
-    mode: AnchorMode = "at_least"
-    champion_score: float | None = None
-    difference: Difference | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ExploiterReport(CompanionReport):
-    """One paired test of candidate and champion against an exploiter.
-
-    margin: as a share of all points or in returns. outcome: `not worse` or `worse`.
-    blocks: counted pairs of blocks. games: of both contestants. counts: pairs per cell, worst for the candidate first.
-    exploits: the champion that the exploiter was trained against.
-    score, champion_score: mean scores of candidate and champion against the exploiter; None without games.
-    difference: between candidate and champion, in the unit of the margin; None without games.
-    """
-
-    exploits: str
-    score: float | None
-    champion_score: float | None
-    difference: Difference | None
-
-
-@dataclass(frozen=True, slots=True)
-class ExploitabilityReport(CompanionReport):
-    """The test of the candidate's learned exploitability against that of the champion, which is `ref`.
-
-    margin: as a share of all points or in returns. improvement: by how much the candidate must be less exploitable, in
-    the same unit; 0 if it need not be.
-    outcome: `not more exploitable` or `more exploitable`; with an improvement `less exploitable` or `not less
-    exploitable`.
-    blocks: counted rounds; each exploiter plays one block in a round. games: of both contestants.
-    candidate, champion: lower bounds of their exploitability, from a fixed number of blocks; None before these.
-    difference: how much more exploitable the candidate is, in the unit of the margin, with an interval over blocks,
-    for these exploiters. difference_over_exploiters: the same with an interval over blocks and exploiters, which holds
-    for others trained in the same way, too. Both are from the fixed number of blocks.
-    """
-
-    improvement: float
-    candidate: Exploitability | None
-    champion: Exploitability | None
-    difference: Difference | None
-    difference_over_exploiters: Difference | None
-
-
-@dataclass(frozen=True, slots=True)
-class VerdictReport(Document):
-    """The test of one candidate with its evidence.
-
-    outcome: `promote`, `reject`, `inconclusive`, or `void` with the reason in `note`.
-    llr, bounds: log likelihood ratio at the end and its bounds; log wealths if returns are tested.
-    blocks, games: counted ones. unique_games: distinct games among them.
-    counts: blocks per cell, worst for the candidate first.
-    score: the candidate's mean score. elo, interval: logistic Elo above the opponent with its 95 % interval; infinite
-    bounds are None.
-    alpha: error probability spent by this verdict. model: of the gate, which decides the units of margins.
-    anchors: non-inferiority tests after the opponent was beaten. exploiters: paired tests after these.
-    exploitability: the test of learned exploitability after all others; None if it was not reached or is not required.
-    difference: mean return minus that of the opponent if contestants are compared on the same side or the gate
-    tests returns, else None.
-    promoted: whether this verdict made the candidate champion.
-    note: why it did not although the opponent was beaten, or why it is void.
-    forfeits: contestant → its forfeits in the counted games, if any.
-    reason, remedy: what decided, with the scores of candidate and champion, and what would have to change for a
-    promotion, in sentences. remedy is None after a promotion and while the verdict is open.
-    """
-
-    verdict: str
-    candidate: str
-    opponent: str
-    outcome: str
-    llr: float
-    bounds: tuple[float, float]
-    blocks: int
-    games: int
-    unique_games: int
-    counts: tuple[int, ...]
-    score: float | None
-    elo: float | None
-    interval: tuple[float | None, float | None] | None
-    promoted: bool
-    alpha: float
-    model: str
-    anchors: tuple[AnchorReport, ...] = ()
-    exploiters: tuple[ExploiterReport, ...] = ()
-    exploitability: ExploitabilityReport | None = None
-    difference: Difference | None = None
-    note: str | None = None
-    forfeits: dict[str, Forfeits] = field(default_factory=dict)
-    reason: str = ""
-    remedy: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Confirmation(Document):
-    """Improvement of a promotion, measured by a match of fixed length. `elo` and `interval` as in VerdictReport."""
-
-    verdict: str
-    candidate: str
-    opponent: str
-    games: int
-    score: float
-    elo: float
-    interval: tuple[float | None, float | None]
-    difference: Difference | None
-
-
-@dataclass(frozen=True, slots=True)
-class NightlyReport(Document):
-    """A nightly run: its verdicts in order, the champion before and after, and all ratings.
-
-    confirmations: confirmation matches played in this run.
-    alpha_spent: by all verdicts of the last 365 days, of the gate's `alpha`.
-    faults: versions that could not be gated or rated, with the reasons; they are retried in the next run.
-    """
-
-    league: str
-    champion_before: str | None
-    champion: str | None
-    verdicts: tuple[VerdictReport, ...]
-    confirmations: tuple[Confirmation, ...]
-    alpha_spent: float
-    faults: tuple[str, ...]
-    leaderboard: tuple[Standing, ...]
-    seconds: float
-
-
-@dataclass(frozen=True, slots=True)
 class Progress(Document):
     """Progress of one schedule.
 
@@ -396,5 +243,5 @@ class Progress(Document):
     cpus: int | None = None
 
 
-Listener = Callable[[Progress | VerdictReport], None]
-"""Receives progress and verdicts, in the process that started the evaluation."""
+Listener = Callable[[Progress], None]
+"""Receives progress, in the process that started the evaluation."""

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evaluation.gating.gate import decide_matches
-from evaluation.gating.sequential_tests import SequentialTest
+from evaluation.gating.gate import SequentialTest, decide_matches
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import verdict
 from league.config.gate import GateConfig

@@ -10,8 +10,7 @@ from copy import deepcopy
 
 import numpy as np
 
-from evaluation.gating.gate import decide_matches
-from evaluation.gating.sequential_tests import SequentialTest
+from evaluation.gating.gate import SequentialTest, decide_matches
 from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import verdict
 from league.config.gate import GateConfig

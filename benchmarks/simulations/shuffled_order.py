@@ -13,8 +13,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from benchmarks.simulations.simulated_gates import EQUALS, stronger
-from evaluation.gating.gate import SequentialMonitor, decide_matches
-from evaluation.gating.sequential_tests import SequentialTest
+from evaluation.gating.gate import SequentialMonitor, SequentialTest, decide_matches
 from evaluation.matches.tournament import ReorderBuffer
 from league.config.gate import GateConfig
 from league.results.records import Game, Match

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from benchmarks.harness import CONFIGS, Target
 from benchmarks.training.learned import one_thread, two_at_once
-from evaluation.gating.exploitability import exploitability
+from evaluation.gating.criteria.exploitability import exploitability
 from evaluation.matches.worker import MatchWorker
 from evaluation.results import ExploiterScore
 from evaluation.schedules.builders import gauntlet

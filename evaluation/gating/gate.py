@@ -4,6 +4,14 @@ The evidence is the score of each block, tested by a GSPRT on Elo. With the mode
 returns, tested by betting. A decision is a function of the settings and of the blocks in schedule order. It does not
 depend on completion times, the number of workers, or blocks after the stopping block.
 
+A test observes blocks against one opponent, or rounds in which candidate and champion are compared. In a round,
+candidate and champion each play a block against an exploiter or an anchor from the same seed, opening and seats. With
+their scores s in [0, 1], the observation is (1 + s_candidate - s_champion) / 2, the score of a contest in which the
+candidate beats the champion by scoring more. What an opening is worth against the opponent cancels.
+
+In the test of exploitability a round has several pairs of blocks, one for each pair of exploiters, all from the same
+seed. s is then the mean over the blocks of a round, because these are not independent.
+
 evaluation/gating/gate_result.py combines the tests of a candidate.
 """
 
@@ -16,15 +24,124 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.gating.observations import Observations, observe
-from evaluation.gating.sequential_tests import SequentialTest
-from evaluation.matches.game_records import unique_games
+from evaluation.matches.game_records import forfeit_difference, unique_games
 from evaluation.statistics.sequential import BettingTest, EloEstimate, bounds, elo_estimate, gsprt_llr
 from league.config.gate import GateConfig
 from league.errors import BoundExceeded
 from league.results.records import GAMES_PER_BLOCK, Match
 
 Outcome = Literal["promote", "reject", "inconclusive"]
+
+
+@dataclass(frozen=True, slots=True)
+class SequentialTest:
+    """A sequential test of a candidate.
+
+    Attributes:
+        settings: The gate's settings, with the hypotheses of this test.
+        candidate: Reference of the candidate.
+        champion: For a comparison with the champion against others, the contestant of every second match. None for a
+            test against one opponent.
+        pairs: Pairs of matches in a round.
+        at_least: Observations to be made even if fewer decide the test.
+    """
+
+    settings: GateConfig
+    candidate: str
+    champion: str | None = None
+    pairs: int = 1
+    at_least: int = 0
+
+    @property
+    def matches_each(self) -> int:
+        """Matches per observation."""
+        return 1 if self.champion is None else 2 * self.pairs
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """Observations of a test, in schedule order.
+
+    Attributes:
+        scores: The candidate's score in each observation, in [0, 1].
+        comparisons: Scores are multiples of 1 / (2 * comparisons).
+        differences: Differences of returns within ±`return_bound`; empty unless the gate tests returns.
+        of_candidate: Mean score of the candidate's blocks in each observation.
+        of_champion: Mean score of the champion's blocks; empty for a test against one opponent.
+    """
+
+    scores: list[float]
+    comparisons: int
+    differences: list[float]
+    of_candidate: list[float]
+    of_champion: list[float]
+
+    def first(self, number: int) -> Observations:
+        """The first ones."""
+        values = (self.scores, self.differences, self.of_candidate, self.of_champion)
+        scores, differences, of_candidate, of_champion = (series[:number] for series in values)
+        return Observations(scores, self.comparisons, differences, of_candidate, of_champion)
+
+    @property
+    def gaps(self) -> list[float]:
+        """What the candidate achieved more than the champion in each round, in the unit of the test's margin."""
+        return [2 * d for d in self.differences] or [2 * score - 1 for score in self.scores]
+
+    @property
+    def means(self) -> tuple[float, float]:
+        """Mean scores of candidate and champion. Requires at least one round."""
+        return sum(self.of_candidate) / len(self.of_candidate), sum(self.of_champion) / len(self.of_champion)
+
+
+def observe(test: SequentialTest, matches: Sequence[Match]) -> Observations:
+    """Observe matches. The matches of an incomplete last round are ignored.
+
+    matches: in schedule order.
+    """
+    comparisons = matches[0].result().games if matches else GAMES_PER_BLOCK
+    if test.champion is None:
+        scores, differences = _blocks(test.settings, matches, test.candidate)
+        return Observations(scores, comparisons, differences, scores, [])
+    whole = matches[: len(matches) // test.matches_each * test.matches_each]
+    by_contestant = [
+        [np.reshape(values, (-1, test.pairs)).mean(axis=1) if values else np.empty(0) for values in blocks]
+        for blocks in (
+            _blocks(test.settings, whole[::2], test.candidate),
+            _blocks(test.settings, whole[1::2], test.champion),
+        )
+    ]
+    (candidate, candidate_returns), (champion, champion_returns) = by_contestant
+    return Observations(
+        scores=((1 + candidate - champion) / 2).tolist(),
+        comparisons=2 * test.pairs * comparisons,
+        differences=((candidate_returns - champion_returns) / 2).tolist(),
+        of_candidate=candidate.tolist(),
+        of_champion=champion.tolist(),
+    )
+
+
+def _blocks(settings: GateConfig, matches: Sequence[Match], contestant: str) -> tuple[list[float], list[float]]:
+    """Score of a contestant in each block, and its difference of returns if the gate tests returns."""
+    scores = [match.score(match.contestants.index(contestant)) for match in matches]
+    return scores, _differences(settings, matches, contestant) if settings.model == "returns" else []
+
+
+def _differences(settings: GateConfig, matches: Sequence[Match], contestant: str) -> list[float]:
+    """Mean return of a contestant minus that of its opponent in each block.
+
+    In blocks with a forfeit, ± `return_bound`, or 0 if both forfeited.
+    """
+    bound, gaps = settings.return_bound or 0.0, list[float]()
+    for match in matches:
+        if (ruled := forfeit_difference(match, contestant)) is not None:
+            gaps.append(ruled * bound)
+            continue
+        index = match.contestants.index(contestant)
+        own_return, other_return = match.mean_return(index), match.mean_return(1 - index)
+        assert own_return is not None
+        assert other_return is not None
+        gaps.append(own_return - other_return)
+    return gaps
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +160,8 @@ class Decision:
             H1 (negative), whichever is larger.
         estimate: Logistic Elo of the candidate above its opponent; None without blocks, and for a comparison of
             candidate and champion against exploiters.
+        counted: The matches of the counted blocks, in schedule order; empty if the decision was made from scores.
+        observations: Those of the counted blocks; None if the decision was made from scores.
     """
 
     outcome: Outcome | None
@@ -54,6 +173,8 @@ class Decision:
     counts: tuple[int, ...]
     curve: tuple[float, ...]
     estimate: EloEstimate | None
+    counted: Sequence[Match] = ()
+    observations: Observations | None = None
 
     @property
     def score(self) -> float | None:
@@ -118,9 +239,14 @@ def decide_matches(test: SequentialTest, matches: Sequence[Match]) -> Decision:
     observations = observe(test, matches)
     decision = decide(test.settings, observations.scores, observations.comparisons, observations.differences)
     counted = matches[: decision.blocks * test.matches_each]
-    games = len(counted) * GAMES_PER_BLOCK
-    estimate = decision.estimate if test.champion is None else None
-    return replace(decision, games=games, unique_games=unique_games(counted), estimate=estimate)
+    return replace(
+        decision,
+        games=len(counted) * GAMES_PER_BLOCK,
+        unique_games=unique_games(counted),
+        estimate=decision.estimate if test.champion is None else None,
+        counted=counted,
+        observations=observations.first(decision.blocks),
+    )
 
 
 def shadow_shortfall(

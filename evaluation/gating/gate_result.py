@@ -1,4 +1,4 @@
-"""The result of a gate: the tests of a candidate in order, and what they decide together.
+"""The result of a gate: what the tests of a candidate show, what they decide together, and why, in sentences.
 
 A candidate that must pass all tests is promoted wrongly with at most the α of one (R. L. Berger, "Multiparameter
 hypothesis testing and acceptance sampling", Technometrics 24, 1982).
@@ -6,240 +6,174 @@ hypothesis testing and acceptance sampling", Technometrics 24, 1982).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
-import numpy as np
-
-from evaluation.gating.gate import Decision, Outcome, decide_matches
-from evaluation.gating.observations import observe
-from evaluation.gating.sequential_tests import SequentialTest, sequential_test
-from evaluation.results import Difference
-from evaluation.statistics.payoff import crossed_interval, student_interval
+from evaluation.gating.gate import Decision, Outcome
+from evaluation.results import Document
 from league.config.gate import GateConfig
-from league.refs import CheckpointRef, parse_ref
-from league.results.records import Match
-from league.verdict_tests import AnchorTest, CompanionTest, ExploitabilityTest, ExploiterTest
+
+MOST_GAMES = 1_000_000
+"""Games beyond which an estimate of those that a test needs is of no use."""
 
 
-@dataclass(frozen=True, slots=True)
-class AnchorResult:
-    """Result of a non-inferiority test against one anchor, with the mode `at_least`."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CriterionReport(Document):
+    """A test of a verdict after that against the champion, with its evidence as in a VerdictReport.
 
-    test: AnchorTest
-    decision: Decision
-
-    @property
-    def failure(self) -> str:
-        """What a `reject` shows."""
-        return f"is weaker than {self.test.ref}"
-
-    @property
-    def claim(self) -> str:
-        """What a `promote` shows."""
-        return f"is at most {self.test.margin:g} weaker than {self.test.ref}"
-
-
-@dataclass(frozen=True, slots=True)
-class PairedResult:
-    """Result of a paired test of candidate and champion against one exploiter, or an anchor with the mode `no_worse`.
-
-    Attributes:
-        test: The test.
-        champion: Reference of the champion.
-        decision: Its decision, whose blocks are pairs of blocks.
-        scores: Mean scores of candidate and champion over the counted pairs; None without pairs.
-        difference: Score of the candidate minus the champion's, or its difference of returns if the gate tests returns.
+    ref: the other contestant. margin: by how much the candidate may be worse. schedule: of the matches that count.
+    outcome: passed, failed, `inconclusive`, or `open` if the verdict was voided before its end.
+    finding: the outcome in words, such as `not inferior to connect_four@1 by 50 Elo after 600 games`.
     """
 
-    test: ExploiterTest | AnchorTest
-    champion: str
-    decision: Decision
-    scores: tuple[float, float] | None
-    difference: Difference | None
-
-    @property
-    def failure(self) -> str:
-        """What a `reject` shows."""
-        return f"does worse than {name_of_champion(self.champion)} against {self._opponent}"
-
-    @property
-    def claim(self) -> str:
-        """What a `promote` shows."""
-        worse = f"at most {self.test.margin:g} worse than {name_of_champion(self.champion)}"
-        return f"is {worse} against {self._opponent}"
-
-    @property
-    def _opponent(self) -> str:
-        match self.test:
-            case AnchorTest(ref=ref):
-                return ref
-            case ExploiterTest(ref=ref, exploits=target):
-                return f"{ref}, an exploiter of {target}"
+    ref: str
+    margin: float
+    schedule: str
+    outcome: str
+    llr: float
+    bounds: tuple[float, float]
+    blocks: int
+    games: int
+    unique_games: int
+    counts: tuple[int, ...]
+    finding: str
 
 
-@dataclass(frozen=True, slots=True)
-class ExploitabilityResult:
-    """Result of a test of candidate and champion, each against exploiters trained against it.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CriterionResult:
+    """What the matches of one test show, in numbers and in words.
 
     Attributes:
-        test: The test.
-        champion: Reference of the champion.
-        decision: Its decision, whose blocks are rounds: one block of each exploiter.
-        sample: Matches of the fixed number of rounds from which exploitability is estimated; empty before these.
-        difference: Score of the candidate's exploiters minus that of the champion's, or the difference of their gains
-            if the gate tests returns; with an interval over blocks. None without a sample.
-        difference_over_exploiters: The same, with an interval over blocks and exploiters.
+        decision: Of the test.
+        report: Its evidence; None for the test against the champion, whose evidence are fields of the verdict.
+        passed: What a `promote` shows, without a subject: `beat the champion`.
+        failed: What a `reject` shows: `is weaker than connect_four@1`.
+        scores: The scores of candidate and champion as a sentence; None without games.
+        requirement: What passes the test, as a sentence.
+        wider: Settings that need fewer games: `a larger margin of the anchor: 50`.
     """
 
-    test: ExploitabilityTest
-    champion: str
     decision: Decision
-    sample: Sequence[Match]
-    difference: Difference | None
-    difference_over_exploiters: Difference | None
-
-    @property
-    def failure(self) -> str:
-        """What a `reject` shows."""
-        more = "not less" if self.test.improvement else "more"
-        return f"is {more} exploitable than {self.champion} by exploiters trained against each"
-
-    @property
-    def claim(self) -> str:
-        """What a `promote` shows."""
-        less = "less" if self.test.improvement else f"at most {self.test.margin:g} more"
-        return f"is {less} exploitable than {self.champion} by exploiters trained against each"
-
-
-CompanionResult = AnchorResult | PairedResult | ExploitabilityResult
-
-
-def name_of_champion(opponent: str) -> str:
-    """`the champion`, or the script that is the opponent of a verdict without a champion."""
-    return "the champion" if isinstance(parse_ref(opponent), CheckpointRef) else opponent
-
-
-def companion_result(
-    gate: GateConfig, test: CompanionTest, candidate: str, champion: str, matches: Sequence[Match]
-) -> CompanionResult:
-    """Decide a test of a verdict. gate: as in `sequential_test`. matches: those of the test, in schedule order."""
-    sequential = sequential_test(gate, test, candidate, champion)
-    decision = decide_matches(sequential, matches)
-    match test:
-        case AnchorTest(mode="at_least"):
-            return AnchorResult(test, decision)
-        case AnchorTest() | ExploiterTest():
-            counted = matches[: decision.blocks * sequential.matches_each]
-            return _paired_result(test, champion, decision, sequential, counted)
-        case ExploitabilityTest():
-            size = sequential.at_least * sequential.matches_each
-            return _exploitability_result(test, decision, sequential, matches[:size] if len(matches) >= size else ())
-
-
-def _paired_result(
-    test: ExploiterTest | AnchorTest,
-    champion: str,
-    decision: Decision,
-    sequential: SequentialTest,
-    counted: Sequence[Match],
-) -> PairedResult:
-    if not counted:
-        return PairedResult(test, champion, decision, None, None)
-    candidate_total, champion_total = (
-        sum(match.score(match.contestants.index(ref)) for match in counted if ref in match.contestants)
-        for ref in (sequential.candidate, sequential.champion)
-    )
-    scores = candidate_total / decision.blocks, champion_total / decision.blocks
-    return PairedResult(test, champion, decision, scores, student_interval(observe(sequential, counted).gaps))
-
-
-def _exploitability_result(
-    test: ExploitabilityTest, decision: Decision, sequential: SequentialTest, sample: Sequence[Match]
-) -> ExploitabilityResult:
-    assert sequential.champion is not None, "it compares candidate and champion"
-    by_block = by_exploiter = None
-    if sample:
-        pair = replace(sequential, pairs=1)
-        gaps = -np.array([observe(pair, pair_matches).gaps for pair_matches in _pairs(sample, sequential.pairs)])
-        by_block, by_exploiter = student_interval(gaps.mean(axis=0).tolist()), crossed_interval(gaps)
-    return ExploitabilityResult(test, sequential.champion, decision, sample, by_block, by_exploiter)
-
-
-def _pairs(matches: Sequence[Match], pairs: int) -> list[list[Match]]:
-    """The matches of whole rounds, by the pair of exploiters that played them."""
-    return [[match for i, match in enumerate(matches) if i // 2 % pairs == pair] for pair in range(pairs)]
+    report: CriterionReport | None
+    passed: str
+    failed: str
+    scores: str | None
+    requirement: str
+    wider: str
 
 
 @dataclass(frozen=True, slots=True)
 class GateResult:
     """Results of all tests of a candidate.
 
-    companions: started tests after that against the champion, in order, of `planned_companions` in total.
-    forfeits: forfeited games, or None if the gate allows them.
-    shown: what the first test showed if it is passed.
+    Attributes:
+        gate: The settings of the test against the champion.
+        champion: The result of that test.
+        further: Results of the tests after it that were started, in order, up to the first that is not passed.
+        planned: Number of tests after that against the champion.
+        forfeits: Games that the candidate forfeited, or None if the gate allows them.
     """
 
-    champion: Decision
-    companions: tuple[CompanionResult, ...] = ()
-    planned_companions: int = 0
+    gate: GateConfig
+    champion: CriterionResult
+    further: tuple[CriterionResult, ...] = ()
+    planned: int = 0
     forfeits: int | None = None
-    shown: str = "it beat the champion"
-
-    @property
-    def anchors(self) -> tuple[AnchorResult | PairedResult, ...]:
-        results = (result for result in self.companions if isinstance(result, AnchorResult | PairedResult))
-        return tuple(result for result in results if isinstance(result.test, AnchorTest))
-
-    @property
-    def exploiters(self) -> tuple[PairedResult, ...]:
-        results = (result for result in self.companions if isinstance(result, PairedResult))
-        return tuple(result for result in results if isinstance(result.test, ExploiterTest))
-
-    @property
-    def exploitability(self) -> ExploitabilityResult | None:
-        return next((result for result in self.companions if isinstance(result, ExploitabilityResult)), None)
 
     @property
     def outcome(self) -> Outcome | None:
         """Outcome of the verdict; None while a test is open."""
-        return self._conclusion()[0]
+        if self.champion.decision.outcome != "promote":
+            return self.champion.decision.outcome
+        if self.forfeits:
+            return "reject"
+        if not self.further or self.further[-1].decision.outcome == "promote":
+            return "promote" if len(self.further) == self.planned else None
+        return self.further[-1].decision.outcome
 
     @property
     def note(self) -> str | None:
         """Why the candidate is not promoted although it passed the test against the champion."""
-        return self._conclusion()[1]
-
-    def _conclusion(self) -> tuple[Outcome | None, str | None]:
-        if self.champion.outcome != "promote":
-            return self.champion.outcome, None
+        if self.outcome in (None, "promote") or self.champion.decision.outcome != "promote":
+            return None
         if self.forfeits:
-            return "reject", f"it forfeited {self.forfeits} games, but the gate allows none"
-        for test in self.companions:
-            if test.decision.outcome == "reject":
-                return "reject", f"{self.shown}, but {test.failure}"
-            if test.decision.outcome == "inconclusive":
-                games = test.decision.games
-                return "inconclusive", f"{self.shown}, but {games} games do not show that it {test.claim}"
-        is_complete = len(self.companions) == self.planned_companions and all(map(_is_passed, self.companions))
-        return ("promote" if is_complete else None), None
+            return f"it forfeited {self.forfeits} games, but the gate allows none"
+        last = self.further[-1]
+        if self.outcome == "reject":
+            return f"it {self.champion.passed}, but {last.failed}"
+        return f"it {self.champion.passed}, but {last.decision.games} games do not show that it {last.passed}"
+
+    def reason(self, outcome: str | None, promoted: bool, note: str | None) -> str:
+        """What decided, and the scores of candidate and champion in each test that was played.
+
+        Args:
+            outcome: Outcome of the verdict; None while it is open.
+            promoted: Whether it made the candidate champion.
+            note: Why it is void, or was not applied.
+        """
+        scores = [result.scores for result in (self.champion, *self.further) if result.scores is not None]
+        return " ".join((self._finding(outcome, promoted, note), *scores))
+
+    def _finding(self, outcome: str | None, promoted: bool, note: str | None) -> str:
+        decision = self.champion.decision
+        passed, failed = ("Stronger", "Not stronger") if self.gate.requires_gain else ("Not inferior", "Inferior")
+        llr, lower, upper = (f"{value:.2f}".replace("-", "−") for value in (decision.llr, *decision.bounds))
+        after = f"after {decision.games} games, the LLR was {llr}"
+        if outcome in ("reject", "inconclusive"):
+            note = self.note or note
+        match outcome:
+            case None if decision.outcome == "promote":
+                return f"Undecided: it {self.champion.passed}, and further tests are under way."
+            case None:
+                return f"Undecided: {after}, between {lower} and {upper}."
+            case "promote" if promoted:
+                return f"{passed}: {after}, above the bound of {upper}."
+            case "promote":
+                return f"{passed} ({after}), but not promoted: {note or 'no reason was recorded'}."
+            case "inconclusive" if note is None:
+                return f"Inconclusive: {after}, between {lower} and {upper}, at the maximum number of games."
+            case "reject" if note is None:
+                return f"{failed}: {after}, below the bound of {lower}."
+        return f"{'Rejected' if outcome == 'reject' else outcome.capitalize()}: {note or after}."
+
+    def remedy(self, outcome: str | None, promoted: bool) -> str | None:
+        """What would have to change for a promotion; None after one, and while the verdict is open.
+
+        outcome, promoted: as in `reason`.
+        """
+        if outcome is None or promoted:
+            return None
+        if outcome not in ("reject", "inconclusive"):
+            return "The next nightly run tests it again, on other games."
+        if self.champion.decision.outcome == "promote" and self.forfeits:
+            return "It must return a legal action in each game. With gate.forfeits: true, forfeits are only lost games."
+        failures = (result for result in self.further if result.decision.outcome in ("reject", "inconclusive"))
+        result = next(failures, self.champion)
+        if outcome == "reject" or not result.decision.blocks:
+            return result.requirement
+        return f"{result.requirement} {self._more_games(result)}"
+
+    def _more_games(self, result: CriterionResult) -> str:
+        """What decides a test that was not decided by `gate.max_blocks`."""
+        decision = result.decision
+        lower, upper = decision.bounds
+        rate = decision.llr / decision.blocks
+        blocks = math.inf if rate == 0 else (upper if rate > 0 else lower) / rate
+        games = blocks * decision.games / decision.blocks
+        if games > MOST_GAMES:
+            return f"It is about halfway between the hypotheses, so that more games hardly help: set {result.wider}."
+        number = _rounded(blocks)
+        if rate < 0:
+            return (
+                f"More games would rather reject it, after about {_rounded(games):,} games (gate.max_blocks: {number})."
+            )
+        return (
+            f"At this rate, it passes after about {_rounded(games):,} games (gate.max_blocks: {number}, now"
+            f" {self.gate.max_blocks}); fewer with {result.wider}."
+        )
 
 
-def _is_passed(test: CompanionResult) -> bool:
-    return test.decision.outcome == "promote"
-
-
-def combine_results(
-    champion: Decision,
-    companions: Sequence[CompanionResult],
-    planned_companions: int,
-    forfeits: int | None,
-    shown: str = "it beat the champion",
-) -> GateResult:
-    """Combine the tests up to the first one after the champion's that is not passed. Later ones are ignored."""
-    looked_at: list[CompanionResult] = []
-    for test in companions if champion.outcome == "promote" and not forfeits else ():
-        looked_at.append(test)
-        if not _is_passed(test):
-            break
-    return GateResult(champion, tuple(looked_at), planned_companions, forfeits, shown)
+def _rounded(number: float) -> int:
+    """Two significant digits, rounded up."""
+    unit = 10 ** max(int(math.log10(number)) - 1, 0)
+    return math.ceil(number / unit) * unit

@@ -7,18 +7,21 @@ match twice, repeating a verdict, or losing or repeating a promotion.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 from evaluation.gating import verdicts
-from evaluation.gating.opponents import rolled_back
+from evaluation.gating.criteria.criterion import Contest
+from evaluation.gating.evidence import Confirmation, VerdictReport, confirmation
+from evaluation.gating.former_champions import rolled_back
 from evaluation.gating.trained_exploiters import Trainer, check_exploiters
-from evaluation.gating.verdict_report import confirmation
 from evaluation.matches import tournament
 from evaluation.matches.leaderboard import compute_leaderboard
 from evaluation.matches.tournament import fixed_baselines
-from evaluation.results import Confirmation, Listener, NightlyReport, VerdictReport
+from evaluation.results import Document, Progress, Standing
 from evaluation.schedules.builders import ANCHOR, gauntlet
 from evaluation.statistics.alpha_spending import alpha_share, alpha_spent
 from league.config.league import LeagueConfig
@@ -42,7 +45,6 @@ from league.refs import CHAMPION
 from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow, NightlyRunRow, VerdictRow, VersionRow
 from league.results.ledger import Ledger
-from league.results.records import Schedule
 
 RATING_BLOCKS = 32
 """Matches of a new version against each opponent for its rating, in addition to those of its verdict."""
@@ -61,6 +63,33 @@ CONTESTANT_FAULTS = (
 )
 """Errors of a single version, which do not prevent verdicts on the others."""
 
+NightlyListener = Callable[[Progress | VerdictReport], None]
+"""Receives progress and verdicts, in the process that started the nightly run."""
+
+
+@dataclass(frozen=True, slots=True)
+class NightlyReport(Document):
+    """A nightly run: its verdicts in order, the champion before and after, and all ratings.
+
+    confirmations: confirmation matches played in this run.
+    alpha_spent: by all verdicts of the last 365 days, of the gate's `alpha`.
+    faults: versions that could not be gated or rated, with the reasons; they are retried in the next run.
+    """
+
+    league: str
+    champion_before: str | None
+    champion: str | None
+    verdicts: tuple[VerdictReport, ...]
+    confirmations: tuple[Confirmation, ...]
+    alpha_spent: float
+    faults: tuple[str, ...]
+    leaderboard: tuple[Standing, ...]
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The document, with the verdicts as they are stored."""
+        return Document.to_json(self) | {"verdicts": [verdict.to_record() for verdict in self.verdicts]}
+
 
 def nightly(
     config: LeagueConfig,
@@ -68,7 +97,7 @@ def nightly(
     registry: Registry,
     train: Trainer | None = None,
     workers: int | None = 0,
-    listener: Listener | None = None,
+    listener: NightlyListener | None = None,
 ) -> NightlyReport:
     """Gate all versions without a verdict, oldest first, each against the current champion.
 
@@ -124,7 +153,7 @@ class _NightlyRun:
         league: LeagueRow,
         train: Trainer | None,
         workers: int | None,
-        listener: Listener | None,
+        listener: NightlyListener | None,
     ) -> None:
         self._registry, self._league, self._train = registry, league, train
         self._workers, self._listener = workers, listener
@@ -187,26 +216,21 @@ class _NightlyRun:
                     self.faults.append(str(error))
 
     def _test_candidates(self, nightly_run: NightlyRunRow) -> None:
+        league = self._league
+        # Without a limit of nightly runs, verdicts do not count against the α of a year.
+        number = None if league.config.gate.nights is None else nightly_run.id
         for version in self._untested():
             if version.number in nightly_run.candidates:
-                self._open_and_conclude(version, nightly_run)
-
-    def _open_and_conclude(self, version: VersionRow, nightly_run: NightlyRunRow) -> None:
-        with self._faults_of(version.ref):
-            opponent = self.champion() or ANCHOR
-            row = verdicts.open_verdict(
-                self._registry, self._league, version.number, opponent, nightly_run.alpha, self._number_of(nightly_run)
-            )
-            self._conclude(row)
-
-    def _number_of(self, nightly_run: NightlyRunRow) -> int | None:
-        """Id of the nightly run, or None if verdicts do not count against the α of a year."""
-        return None if self._league.config.gate.nights is None else nightly_run.id
+                with self._faults_of(version.ref):
+                    opponent, alpha = self.champion() or ANCHOR, nightly_run.alpha
+                    self._conclude(
+                        verdicts.open_verdict(self._registry, league, version.number, opponent, alpha, number)
+                    )
 
     def confirm(self) -> None:
         """Play the missing confirmation matches of promotions."""
         for row in self._registry.verdicts.all(self._league.slug):
-            if row.outcome == "promote" and confirmation(self._registry, row) is None:
+            if row.outcome == "promote" and confirmation(Contest.of(self._registry, row)) is None:
                 with self._faults_of(f"the confirmation of {row.league}@{row.candidate}"):
                     gain = verdicts.confirm(self._registry, row, workers=self._workers, listener=self._listener)
                     if gain is not None:
@@ -218,16 +242,22 @@ class _NightlyRun:
 
     def rate(self) -> None:
         """Play the missing or unfinished rating gauntlet of each version."""
-        ledger = Ledger(self._registry)
-        conditions = self._league.conditions
+        ledger, league = Ledger(self._registry), self._league
         gauntlets = {
             schedule.contestants[0]: schedule
-            for schedule in ledger.schedules(self._league.slug)
-            if schedule.kind == "gauntlet" and schedule.conditions == conditions
+            for schedule in ledger.schedules(league.slug)
+            if schedule.kind == "gauntlet" and schedule.conditions == league.conditions
         }
-        versions = eligible(self._registry, self._league.slug)
+        versions = eligible(self._registry, league.slug)
+        refs = {version.ref for version in versions}
         for previous, version in zip([None, *versions], versions, strict=False):
-            schedule = gauntlets.get(version.ref) or self._gauntlet(version, previous)
+            if (schedule := gauntlets.get(version.ref)) is None:
+                rivals = (self.champion(), None if previous is None else previous.ref)
+                opponents = fixed_baselines(self._registry, league)
+                opponents += [ref for ref in rivals if ref is not None and ref in refs - {version.ref}]
+                schedule = gauntlet(
+                    league.config, league.interface, [version.ref], list(dict.fromkeys(opponents)), RATING_BLOCKS
+                )
             if len(ledger.positions(schedule.id)) < schedule.length:
                 with self._faults_of(version.ref):
                     tournament.play_schedule(
@@ -235,15 +265,15 @@ class _NightlyRun:
                     )
 
     def _untested(self) -> list[VersionRow]:
-        """Versions without a verdict, oldest first."""
-        return [version for version in eligible(self._registry, self._league.slug) if not self._is_tested(version)]
-
-    def _is_tested(self, version: VersionRow) -> bool:
-        """Whether a version is champion, was rolled back, or has an effective verdict."""
-        if version.ref == self.champion() or version.number in rolled_back(self._registry, version.league):
-            return True
-        rows = (row for row in self._registry.verdicts.all(self._league.slug) if row.candidate == version.number)
-        return any(verdicts.is_effective(row) for row in rows)
+        """Versions without an effective verdict that are not champion and were not rolled back, oldest first."""
+        league, champion = self._league.slug, self.champion()
+        former = rolled_back(self._registry.aliases.history(league))
+        tested = {row.candidate for row in self._registry.verdicts.all(league) if verdicts.is_effective(row)}
+        return [
+            version
+            for version in eligible(self._registry, league)
+            if version.ref != champion and version.number not in former | tested
+        ]
 
     def _conclude(self, verdict: VerdictRow) -> None:
         with self._faults_of(f"{verdict.league}@{verdict.candidate} against {verdict.champion}"):
@@ -253,16 +283,6 @@ class _NightlyRun:
             self.verdicts.append(report)
             if self._listener:
                 self._listener(report)
-
-    def _gauntlet(self, version: VersionRow, previous: VersionRow | None) -> Schedule:
-        """Schedule against the baselines, the champion and the previous version."""
-        versions = {row.ref for row in eligible(self._registry, self._league.slug)} - {version.ref}
-        rivals = (self.champion(), previous.ref if previous else None)
-        opponents = fixed_baselines(self._registry, self._league)
-        opponents += [ref for ref in rivals if ref and ref in versions]
-        return gauntlet(
-            self._league.config, self._league.interface, [version.ref], list(dict.fromkeys(opponents)), RATING_BLOCKS
-        )
 
     @contextmanager
     def _faults_of(self, who: str) -> Iterator[None]:

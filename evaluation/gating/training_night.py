@@ -11,10 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from evaluation.gating.exploitability import exploitability
-from evaluation.gating.nightly import nightly
+from evaluation.gating.criteria.exploitability import exploitability
+from evaluation.gating.nightly import NightlyListener, NightlyReport, nightly
 from evaluation.gating.trained_exploiters import Trainer, check_exploiters, trainable_version, trained_exploiters
-from evaluation.results import Listener, NightlyReport
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import AlreadyRunning, LeagueError, StorageError, UnknownRun, one_line
@@ -35,7 +34,7 @@ class _Night:
     row: TrainingNightRow
     train: Trainer
     workers: int | None
-    listener: Listener | None
+    listener: NightlyListener | None
     announce: Callable[[str], None]
     gate_report: NightlyReport | None = field(default=None)
 
@@ -69,7 +68,7 @@ def training_night(
     registry: Registry,
     train: Trainer,
     workers: int | None = 0,
-    listener: Listener | None = None,
+    listener: NightlyListener | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> tuple[TrainingNightRow, NightlyReport | None]:
     """Begin a league's night of training, or continue the one that was interrupted.

@@ -11,20 +11,29 @@ there is closed and never applied twice, even if the champion was rolled back me
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
+from evaluation.gating.criteria.criterion import Contest, Criterion
+from evaluation.gating.evidence import (
+    CRITERIA,
+    Confirmation,
+    VerdictReport,
+    confirmation,
+    evidence,
+    gate_result,
+    is_applied,
+    verdict_of,
+)
 from evaluation.gating.gate import SequentialMonitor, shadow_shortfall
-from evaluation.gating.gate_result import AnchorResult, GateResult, PairedResult
-from evaluation.gating.opponents import recent_exploiters, resolve_anchors
-from evaluation.gating.sequential_tests import SequentialTest, sequential_test
-from evaluation.gating.trained_exploiters import Trainer, prepared_test
-from evaluation.gating.verdict_report import confirmation, gate_of, gate_result, is_applied, report_of
+from evaluation.gating.gate_result import GateResult
+from evaluation.gating.trained_exploiters import Trainer
 from evaluation.matches import tournament
-from evaluation.results import Confirmation, Listener, Progress, VerdictReport
-from evaluation.schedules.builders import companion, paired_test
+from evaluation.results import Listener, Progress
+from evaluation.schedules.builders import companion
 from evaluation.schedules.builders import verdict as verdict_schedule
-from league.config.gate import GateConfig
 from league.errors import AliasMoved
 from league.histograms import Histogram
 from league.refs import CHAMPION, CheckpointRef, RemoteRef, ScriptRef, parse_ref
@@ -32,8 +41,7 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow, VerdictRow
 from league.registry.verdicts import VOID
 from league.results.ledger import Ledger
-from league.results.records import Match, Schedule
-from league.verdict_tests import AnchorTest, CompanionTest, CompanionTests, ExploiterTest
+from league.results.records import Match
 
 ACTOR = "league nightly"
 
@@ -96,46 +104,24 @@ def open_verdict(
     ]
     if (resumed := next((row for row in earlier if row.outcome is None), None)) is not None:
         return resumed
-    config, candidate_ref, ledger = league.config, f"{league.slug}@{candidate}", Ledger(registry)
-    gate = config.gate if _is_version(opponent) else config.gate.against_baseline()
-    gate = gate.of_one_verdict(gate.alpha if alpha is None else alpha)
-    schedule = verdict_schedule(config, league.interface, candidate_ref, opponent, gate, seed=len(earlier))
-    ledger.open(schedule)
-    tests = _opened_tests(registry, league, candidate, schedule, gate)
-    settings = {"gate": gate.model_dump(mode="json"), "night": nightly_run} | tests.to_settings()
-    return registry.verdicts.open(league.slug, candidate, opponent, schedule.id, settings)
-
-
-def _is_version(opponent: str) -> bool:
-    return isinstance(parse_ref(opponent), CheckpointRef)
-
-
-def _opened_tests(
-    registry: Registry, league: LeagueRow, candidate: int, schedule: Schedule, gate: GateConfig
-) -> CompanionTests:
-    """Choose the tests of a verdict after that against the champion, and open their schedules."""
     config, interface, ledger = league.config, league.interface, Ledger(registry)
-    opponent = schedule.contestants[1]
-    anchors, exploiters, confirmation = list[AnchorTest](), list[ExploiterTest](), None
-    for anchor in resolve_anchors(registry, league, candidate, opponent):
-        mode = anchor.tested_mode
-        play = companion if mode == "at_least" else paired_test
-        test_schedule = play(config, interface, "anchor", schedule, anchor.ref, gate.max_blocks)
-        anchors.append(AnchorTest(anchor.ref, gate.margin_of(anchor), ledger.open(test_schedule).id, mode))
-    for exploiter in recent_exploiters(registry, league, opponent):
-        assert exploiter.exploits is not None, "it is an exploiter"
-        test_schedule = paired_test(config, interface, "exploiter", schedule, exploiter.ref, gate.max_blocks)
-        margin = gate.margin_against_exploiters
-        exploiters.append(ExploiterTest(exploiter.ref, exploiter.exploits, margin, ledger.open(test_schedule).id))
+    gate = config.gate if isinstance(parse_ref(opponent), CheckpointRef) else config.gate.against_baseline()
+    gate = gate.of_one_verdict(gate.alpha if alpha is None else alpha)
+    schedule = verdict_schedule(config, interface, f"{league.slug}@{candidate}", opponent, gate, seed=len(earlier))
+    tests = [test for kind in CRITERIA for test in kind.planned(registry, league, schedule, gate)]
+    schedules = [test_schedule for _, test_schedule in tests]
+    settings: dict[str, Any] = {
+        "gate": gate.model_dump(mode="json"),
+        "night": nightly_run,
+        "tests": [test.to_record() for test, _ in tests[1:]],
+    }
     if gate.confirmation_blocks:
-        test_schedule = companion(config, interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
-        confirmation = ledger.open(test_schedule).id
-    return CompanionTests(
-        anchors=tuple(anchors),
-        exploiters=tuple(exploiters),
-        awaits_exploiters=bool(gate.exploiters.count) and _is_version(opponent) and len(interface.sides) > 1,
-        confirmation=confirmation,
-    )
+        match = companion(config, interface, "confirmation", schedule, opponent, gate.confirmation_blocks)
+        settings["confirmation"] = match.id
+        schedules.append(match)
+    for opened in filter(None, schedules):
+        ledger.open(opened)
+    return registry.verdicts.open(league.slug, candidate, opponent, schedule.id, settings)
 
 
 def conclude(
@@ -163,27 +149,20 @@ def conclude(
         AlreadyRunning: Another process trains an exploiter of this verdict.
         LeagueError: The errors of `play_schedule`.
     """
-    if (obstacle := _obstacle(registry, verdict)) is not None:
-        return _close(registry, verdict, VOID, gate_result(registry, verdict), note=obstacle)
-    for schedule, watch in _tests(registry, verdict, train):
-        _play(registry, verdict, schedule, watch, workers, listener)
-        if registry.verdicts.get(verdict.id).outcome is not None or gate_result(registry, verdict).outcome is not None:
-            break
-    verdict = registry.verdicts.get(verdict.id)
-    result = gate_result(registry, verdict)
-    if verdict.outcome is not None:
-        return report_of(registry, verdict, verdict.outcome, result, (verdict.evidence or {}).get("note"))
-    if is_applied(registry, verdict):
-        obstacle = None
-    elif result.outcome == "promote":
-        obstacle = _changed_conditions(registry, verdict)  # `promote` finds out whether the champion has moved
-    else:
-        obstacle = _obstacle(registry, verdict)
-    if obstacle is not None:
-        return _close(registry, verdict, VOID, result, note=obstacle)
-    assert result.outcome is not None, "a schedule ends with its test"
-    refused = promote(registry, verdict, _reason(verdict, result)) if result.outcome == "promote" else result.note
-    return _close(registry, verdict, result.outcome, result, note=refused)
+    contest = Contest.of(registry, verdict)
+    if (obstacle := _obstacle(contest)) is not None:
+        return _close(contest, gate_result(contest), VOID, obstacle)
+    result = gate_result(contest, partial(_play, contest, train, workers, listener))
+    if (row := registry.verdicts.get(verdict.id)).outcome is not None:
+        return verdict_of(registry, row)
+    # `promote` finds out whether the champion has moved.
+    outcome = result.outcome
+    obstacle = _changed_conditions(contest) if outcome == "promote" else _obstacle(contest)
+    if obstacle is not None and not is_applied(registry, verdict):
+        return _close(contest, result, VOID, obstacle)
+    assert outcome is not None, "a schedule ends with its test"
+    refused = promote(registry, verdict, _reason(contest, result)) if outcome == "promote" else result.note
+    return _close(contest, result, outcome, refused)
 
 
 def void(registry: Registry, verdict: str, *, actor: str, reason: str, purge: bool = False) -> VerdictRow:
@@ -201,83 +180,73 @@ def void(registry: Registry, verdict: str, *, actor: str, reason: str, purge: bo
     return row
 
 
-def _tests(
-    registry: Registry, verdict: VerdictRow, train: Trainer | None
-) -> Iterator[tuple[Schedule, SequentialMonitor]]:
-    """The schedules of a verdict in order, each with a monitor of its test.
-
-    Before the last one, the exploiters that it needs are trained. It is left out if the verdict is closed meanwhile, or
-    cannot continue.
-    """
-    gate, candidate, companions, ledger = gate_of(verdict), verdict.candidate_ref, verdict.companions, Ledger(registry)
-
-    def monitored(test: CompanionTest) -> tuple[Schedule, SequentialMonitor]:
-        sequential = sequential_test(gate, test, candidate, verdict.champion)
-        return ledger.schedule(test.schedule), SequentialMonitor(sequential)
-
-    yield ledger.schedule(verdict.schedule), SequentialMonitor(SequentialTest(gate, candidate))
-    for anchor in companions.anchors:
-        yield monitored(anchor)
-    for exploiter in companions.exploiters:
-        yield monitored(exploiter)
-    if not companions.includes_exploitability or _obstacle(registry, verdict) is not None:
-        return
-    if (test := prepared_test(registry, verdict, train)) is not None:
-        yield monitored(test)
-
-
 def _play(
-    registry: Registry,
-    verdict: VerdictRow,
-    schedule: Schedule,
-    watch: SequentialMonitor,
-    workers: int | None,
-    listener: Listener | None,
-) -> None:
-    """Play one of its tests until it is decided or the verdict is closed by another process."""
+    contest: Contest, train: Trainer | None, workers: int | None, listener: Listener | None, test: Criterion
+) -> Criterion | None:
+    """Play a test until it is decided or the verdict is closed by another process.
 
-    def report(progress: Progress | VerdictReport) -> None:
-        if listener and isinstance(progress, Progress):
-            listener(replace(progress, llr=watch.llr, bounds=watch.bounds))
+    Opponents that it needs are trained before.
+
+    Returns:
+        The test; None if the verdict was closed meanwhile, or cannot continue.
+    """
+    registry, verdict = contest.registry, contest.verdict.id
+
+    def is_closed() -> bool:
+        return registry.verdicts.get(verdict).outcome is not None
+
+    if test.schedule != verdict and is_closed():
+        return None
+    if test.schedule is None:
+        prepared = None if _obstacle(contest) is not None else test.prepared(contest, train)
+        if prepared is None or prepared.schedule is None:
+            return None
+        test = prepared
+    assert test.schedule is not None, "its opponents are trained"
+    schedule, monitor = contest.ledger.schedule(test.schedule), SequentialMonitor(test.sequential(contest))
+
+    def report(progress: Progress) -> None:
+        if listener:
+            listener(replace(progress, llr=monitor.llr, bounds=monitor.bounds))
 
     def enough(matches: Sequence[Match]) -> bool:
-        return watch.is_over(matches) or registry.verdicts.get(verdict.id).outcome is not None
+        return monitor.is_over(matches) or is_closed()
 
     tournament.play_schedule(schedule, registry=registry, workers=workers, enough=enough, listener=report)
+    return test
 
 
-def _obstacle(registry: Registry, verdict: VerdictRow) -> str | None:
-    """Why this verdict cannot continue: the champion or the environment has changed, or its promotion is impossible."""
+def _obstacle(contest: Contest) -> str | None:
+    """Why a verdict cannot continue: the champion or the environment has changed, or its promotion is impossible."""
+    registry, verdict = contest.registry, contest.verdict
     if is_applied(registry, verdict):
         return None
     champion = registry.aliases.current(verdict.league).get(CHAMPION)
     if champion != tested_champion(verdict):
         holder = "there is no champion" if champion is None else f"the champion is {verdict.league}@{champion}"
         return f"{holder} now, but the test was against {verdict.champion}"
-    if (changed := _changed_conditions(registry, verdict)) is not None:
+    if (changed := _changed_conditions(contest)) is not None:
         return changed
-    return None if champion is None else _below_floor(registry, verdict, champion)
+    return None if champion is None else _below_floor(contest, champion)
 
 
-def _changed_conditions(registry: Registry, verdict: VerdictRow) -> str | None:
+def _changed_conditions(contest: Contest) -> str | None:
     """Why the games of this verdict do not count any more: the league's game or selection of actions has changed."""
-    tested_conditions = Ledger(registry).schedule(verdict.schedule).conditions
-    current_conditions = registry.leagues.get(verdict.league).conditions
-    if tested_conditions.game_digest != current_conditions.game_digest:
+    tested = contest.schedule.conditions
+    current = contest.registry.leagues.get(contest.verdict.league).conditions
+    if tested.game_digest != current.game_digest:
         return "the league's game has changed"
-    if tested_conditions.actions != current_conditions.actions:
-        return (
-            f"the league plays with {current_conditions.actions} actions now,"
-            f" but the test was with {tested_conditions.actions} ones"
-        )
+    if tested.actions != current.actions:
+        return f"the league plays with {current.actions} actions now, but the test was with {tested.actions} ones"
     return None
 
 
-def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str | None:
+def _below_floor(contest: Contest, champion: int) -> str | None:
     """Why the candidate is not tested: insufficient results as the champion's shadow.
 
     Replicas count for the members of a mixture.
     """
+    registry, verdict = contest.registry, contest.verdict
     mixtures = registry.versions.mixtures(verdict.league, [verdict.candidate, champion])
     candidates, champions = (
         mixtures[number].versions if number in mixtures else (number,) for number in (verdict.candidate, champion)
@@ -293,31 +262,23 @@ def _below_floor(registry: Registry, verdict: VerdictRow, champion: int) -> str 
     for counts in shadow_counts:
         latency.merge(counts.latency, counts.ns)
     failed = sum(counts.failed for counts in shadow_counts)
-    return shadow_shortfall(gate_of(verdict), observations, failed, agreement, latency.quantile(0.95))
+    return shadow_shortfall(contest.gate, observations, failed, agreement, latency.quantile(0.95))
 
 
-def _reason(verdict: VerdictRow, seen: GateResult) -> str:
-    decision = seen.champion
-    strong = ", ".join(test_result.test.ref for test_result in seen.companions if isinstance(test_result, AnchorResult))
-    paired = ", ".join(test_result.test.ref for test_result in seen.companions if isinstance(test_result, PairedResult))
-    anchors = f", and is not inferior to {strong}" if strong else ""
-    no_worse = f", and does no worse than it against {paired}" if paired else ""
-    exploitability = ""
-    if (result := seen.exploitability) is not None:
-        exploitability = (
-            f", and is {'less' if result.test.improvement else 'not more'} exploitable by its own exploiters"
-        )
-    comparison = "beat" if gate_of(verdict).requires_gain else "is not inferior to"
+def _reason(contest: Contest, result: GateResult) -> str:
+    decision = result.champion.decision
+    comparison = "beat" if contest.gate.requires_gain else "is not inferior to"
+    further = "".join(f", and {test.passed}" for test in result.further)
     return (
-        f"{comparison} {verdict.champion} over {decision.games} games: score {decision.score:.3f},"
-        f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{anchors}{no_worse}{exploitability}"
+        f"{comparison} {contest.champion} over {decision.games} games: score {decision.score:.3f},"
+        f" LLR {decision.llr:.2f} of {decision.bounds[1]:.2f}{further}"
     )
 
 
-def _close(registry: Registry, verdict: VerdictRow, outcome: str, seen: GateResult, note: str | None) -> VerdictReport:
-    report = report_of(registry, verdict, outcome, seen, note)
-    registry.verdicts.close(verdict.id, outcome, report.to_json())
-    return report
+def _close(contest: Contest, result: GateResult, outcome: str, note: str | None) -> VerdictReport:
+    closed = evidence(contest, result, outcome, note)
+    contest.registry.verdicts.close(contest.verdict.id, outcome, closed.to_record())
+    return closed
 
 
 def confirm(
@@ -327,11 +288,11 @@ def confirm(
 
     None if nothing was promoted, no confirmation is configured, or the league's conditions have changed.
     """
-    schedule = verdict.companions.confirmation
+    schedule = verdict.confirmation
     if verdict.outcome != "promote" or not is_effective(verdict) or schedule is None:
         return None
     whole = Ledger(registry).schedule(schedule)
     if whole.conditions != registry.leagues.get(verdict.league).conditions:
         return None
     tournament.play_schedule(whole, registry=registry, workers=workers, listener=listener)
-    return confirmation(registry, verdict)
+    return confirmation(Contest.of(registry, verdict))

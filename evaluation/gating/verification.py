@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.gating.verdict_report import gate_result, report_of
+from evaluation.gating.criteria.criterion import Contest
+from evaluation.gating.evidence import evidence, gate_result
 from evaluation.playback.replay import replay
 from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
@@ -30,6 +31,9 @@ from league.results.scoring import admit
 ROUNDING = 1e-6
 """Tolerance for derived floats (LLR, Elo, scores, intervals), relative and absolute: rounding differs between
 processors and BLAS kernels, and iterative estimates converge to 1e-8. Outcomes, counts and games must be equal."""
+
+SENTENCES = ("reason", "remedy", "finding")
+"""Fields of the evidence that are in the words of the release that wrote them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,14 +72,13 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     if row.outcome is None or row.evidence is None:
         raise InvalidInput(f"verdict {row.short_id} is still open: `league nightly` resumes it")
     matches = [match for name in row.tested_schedules for match in _checked_matches(registry, row, name)]
-    result = gate_result(registry, row)
+    contest = Contest.of(registry, row)
+    result = gate_result(contest)
     # A verdict can be voided for reasons outside its games, at any point.
     outcome = VOID if row.outcome == VOID else str(result.outcome)
     note = result.note if outcome not in (VOID, "promote") else row.evidence.get("note")
-    report = report_of(registry, row, outcome, result, note)
-    computed = report.to_json()
-    # Sentences, in the words of the release that wrote them.
-    del computed["reason"], computed["remedy"]
+    recomputed = evidence(contest, result, outcome, note)
+    computed = {name: value for name, value in recomputed.to_record().items() if name not in SENTENCES}
     if row.outcome == VOID:
         # A voided verdict keeps its evidence, which is empty if it was open.
         computed = {name: value for name, value in computed.items() if name in row.evidence and name != "outcome"}
@@ -90,7 +93,7 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     conditions = Ledger(registry).schedule(row.schedule).conditions
     is_current = conditions == registry.leagues.get(row.league).conditions
     return Verification(
-        row.id, row.outcome, len(matches), len(computed), replayed, is_current, report.reason, report.remedy
+        row.id, row.outcome, len(matches), len(computed), replayed, is_current, recomputed.reason, recomputed.remedy
     )
 
 
@@ -110,7 +113,9 @@ def _checked_matches(registry: Registry, row: VerdictRow, name: str) -> list[Mat
 
 def _same(recorded: Any, computed: Any) -> bool:
     if isinstance(computed, dict):
-        return isinstance(recorded, dict) and all(_same(recorded.get(key), value) for key, value in computed.items())
+        return isinstance(recorded, dict) and all(
+            key in SENTENCES or _same(recorded.get(key), value) for key, value in computed.items()
+        )
     if isinstance(computed, list):
         return isinstance(recorded, list) and len(recorded) == len(computed) and all(map(_same, recorded, computed))
     if isinstance(computed, float) and isinstance(recorded, int | float):

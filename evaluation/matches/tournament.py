@@ -26,7 +26,7 @@ from ray.exceptions import RayError, RayTaskError
 from evaluation.matches.game_records import forfeits_of_all, unique_games
 from evaluation.matches.leaderboard import by_side, rank_contestants
 from evaluation.matches.worker import match_worker, num_envs
-from evaluation.results import EvaluationReport, Listener, Progress, StoppedBy, VerdictReport
+from evaluation.results import EvaluationReport, Listener, Progress, StoppedBy
 from evaluation.schedules.builders import ANCHOR
 from evaluation.schedules.tournament_plan import (
     DEFAULT_BLOCKS,
@@ -248,8 +248,8 @@ def _play_plan(
     def enough(own: Sequence[Match]) -> bool:
         return limit.is_reached([*matches, *own])
 
-    def report_progress(progress: Progress | VerdictReport) -> None:
-        if listener and isinstance(progress, Progress):
+    def report_progress(progress: Progress) -> None:
+        if listener:
             listener(replace(progress, played=len(matches) + progress.played, of=limit.most))
 
     while not limit.is_reached(matches) and (schedule := plan.next_schedule(matches)) is not None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import httpx
 
-from evaluation.results import NightlyReport
+from evaluation.gating.nightly import NightlyReport
 from league.errors import ConfigError, RemoteError, one_line
 
 ATTEMPTS = 3

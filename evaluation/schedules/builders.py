@@ -140,36 +140,25 @@ def companion(
 
 
 def paired_test(
-    config: LeagueConfig, interface: Interface, kind: str, verdict: Schedule, opponent: str, blocks: int
-) -> Schedule:
-    """The candidate of a verdict and its champion play up to `blocks` matches each against an exploiter or an anchor.
-
-    Their matches alternate, the candidate's first. The two matches of a round have the same seed, opening and seats.
-    kind: `exploiter` or `anchor`.
-    """
-    contestants, pairings = [*verdict.contestants, opponent], [(0, 2), (1, 2)]
-    length, seed = blocks * len(pairings), verdict.seed
-    schedule = _schedule(config, interface, kind, contestants, pairings, length, seed, of=verdict.id)
-    return replace(schedule, common_seeds=True)
-
-
-def exploitability_test(
     config: LeagueConfig,
     interface: Interface,
+    kind: str,
     verdict: Schedule,
-    of_candidate: Sequence[str],
-    of_champion: Sequence[str],
+    pairs: Sequence[tuple[str, str]],
     rounds: int,
 ) -> Schedule:
-    """The candidate of a verdict and its champion play up to `rounds` matches against each of their own exploiters.
+    """The candidate of a verdict and its champion play up to `rounds` matches each against the opponents of a pair.
 
     Their matches alternate, the candidate's first. All matches of a round have the same seed, opening and seats.
+    kind: `anchor` or `exploiter`, with one opponent of both, or `exploitability`.
+    pairs: opponent of the candidate and opponent of the champion.
     """
-    number = len(of_candidate)
-    contestants = [*verdict.contestants, *of_candidate, *of_champion]
-    pairings = [pairing for i in range(number) for pairing in ((0, 2 + i), (1, 2 + number + i))]
+    of_candidate, of_champion = zip(*pairs, strict=True)
+    contestants = list(dict.fromkeys([*verdict.contestants, *of_candidate, *of_champion]))
+    number = {ref: i for i, ref in enumerate(contestants)}
+    pairings = [pairing for first, second in pairs for pairing in ((0, number[first]), (1, number[second]))]
     length, seed = rounds * len(pairings), verdict.seed
-    schedule = _schedule(config, interface, "exploitability", contestants, pairings, length, seed, of=verdict.id)
+    schedule = _schedule(config, interface, kind, contestants, pairings, length, seed, of=verdict.id)
     return replace(schedule, common_seeds=True)
 
 

@@ -20,9 +20,10 @@ from typing import Any, Self
 
 from ray.exceptions import RayError
 
-from evaluation.gating.nightly import nightly
+from evaluation.gating.evidence import VerdictReport
+from evaluation.gating.nightly import NightlyListener, NightlyReport, nightly
 from evaluation.matches.tournament import evaluate
-from evaluation.results import EvaluationReport, Listener, NightlyReport, Progress, VerdictReport
+from evaluation.results import EvaluationReport, Progress
 from evaluation.schedules.tournament_plan import Budget
 from evaluation.service.evaluation_supervisor import EvaluationJobOptions
 from league.errors import LeagueError, StorageError, one_line, to_document
@@ -66,7 +67,7 @@ def run_evaluation(options: EvaluationJobOptions, registry: Registry) -> None:
 
 
 def _report(
-    evaluation: EvaluationRow, registry: Registry, workers: int, listener: Listener
+    evaluation: EvaluationRow, registry: Registry, workers: int, listener: NightlyListener
 ) -> EvaluationReport | NightlyReport:
     """Dispatch the stored request.
 

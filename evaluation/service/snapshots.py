@@ -23,7 +23,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from evaluation.gating.verdict_evidence import verdict_evidence
+from evaluation.gating.evidence import verdict_of
 from evaluation.matches.leaderboard import CountedGames, rated_version
 from evaluation.reporting.gate_record import why_not_champion
 from evaluation.service.earlier_results import earlier_results, refresh_earlier_results, tables
@@ -87,7 +87,7 @@ def _refresh_verdicts(registry: Registry, league: str) -> None:
         if marks.get(part) == mark:
             continue
         try:
-            document = verdict_evidence(registry, verdict, events).to_json()
+            document = verdict_of(registry, verdict).to_json()
         except StorageError:
             raise
         except Exception:  # one broken verdict must not block the others

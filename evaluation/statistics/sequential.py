@@ -58,6 +58,12 @@ class EloEstimate:
     low: float
     high: float
 
+    @property
+    def interval(self) -> tuple[float | None, float | None]:
+        """The bounds, with None for infinite ones."""
+        low, high = (bound if math.isfinite(bound) else None for bound in (self.low, self.high))
+        return low, high
+
 
 def bounds(alpha: float, beta: float) -> tuple[float, float]:
     """Wald's bounds of the log likelihood ratio.

@@ -7,7 +7,9 @@ from pydantic import Field, model_validator
 
 from league.config.base import ContestantRef, Part
 from league.refs import CheckpointRef, of_league, parse_ref
-from league.verdict_tests import AnchorMode
+
+AnchorMode = Literal["no_worse", "at_least"]
+"""What a test against an anchor compares the candidate with: the champion's results against it, or the anchor."""
 
 MAX_NORMALIZED_ELO = 190
 """Bound for hypotheses with a usable test; see evaluation/statistics/sequential.py."""
@@ -115,7 +117,7 @@ class GateConfig(Part):
     latency_ms: float | None = Field(default=None, gt=0)
     """Maximum of the 95th percentile of the candidate's CPU time per mirrored request, in milliseconds."""
     shadow_observations: int = Field(default=1000, ge=1)
-    """Minimum number of mirrored observations for these two criteria."""
+    """Minimum number of mirrored observations for these two settings."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -16,7 +16,6 @@ from league.refs import SHORT_VERDICT, VERDICT, verdict_digest
 from league.registry import leagues, versions
 from league.registry.storage.database import Repository, insert, repeat_after_deadlock
 from league.registry.storage.rows import AliasEvent, NightlyRunRow, VerdictRow
-from league.verdict_tests import CompanionTests, ExploitabilityTest
 
 VOID = "void"
 MAX_LISTED = 5
@@ -43,15 +42,20 @@ class VerdictRepository(Repository):
             return verdict
 
     @repeat_after_deadlock
-    def settle(self, verdict: str, test: ExploitabilityTest) -> VerdictRow:
-        """Record the test of exploitability of a verdict that awaits its exploiters, and return the verdict.
+    def settle(self, verdict: str, test: dict[str, Any]) -> VerdictRow:
+        """Record the schedule of a test whose opponents are trained now, and return the verdict.
 
-        Other verdicts stay as they are. Raises UnknownVerdict.
+        A closed verdict, and a test that has a schedule, stay as they are. Raises UnknownVerdict.
+        test: its record, in place of that of the same kind.
         """
         with self._database.write() as session:
             row = session.get(VerdictRow, verdict, with_for_update=True) or _unknown(verdict)
-            if row.outcome is None and CompanionTests.of_settings(row.settings).awaits_exploiters:
-                row.settings = row.settings | {"exploitability": test.to_record()}
+            if row.outcome is None:
+                tests = [
+                    test if (record["kind"], record["schedule"]) == (test["kind"], None) else record
+                    for record in row.settings["tests"]
+                ]
+                row.settings = row.settings | {"tests": tests}
             return row
 
     @repeat_after_deadlock

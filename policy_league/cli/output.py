@@ -14,12 +14,13 @@ from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
-from evaluation.reporting import wording
 from league.refs import short_verdict
 
 if TYPE_CHECKING:
-    from evaluation.results import Difference, ExploitabilityReport, Listener, Standing, VerdictReport
+    from evaluation.gating.evidence import VerdictReport
+    from evaluation.gating.nightly import NightlyListener
     from evaluation.results import Progress as Games
+    from evaluation.results import Standing
     from league.registry.registry import Registry
 
 console = Console(highlight=False)
@@ -220,7 +221,7 @@ class GameProgress:
         self._task = self._bar.add_task("", total=None, note="")
         self._next_line = time.monotonic() + SECONDS_PER_LINE
 
-    def __enter__(self) -> "Listener":
+    def __enter__(self) -> "NightlyListener":
         if self._has_bar:
             self._bar.start()
         return self._show
@@ -242,9 +243,9 @@ class GameProgress:
     def _show(self, event: "Games | VerdictReport") -> None:
         if self._quiet:
             return
-        from evaluation.results import VerdictReport
+        from evaluation.results import Progress as Games
 
-        if isinstance(event, VerdictReport):
+        if not isinstance(event, Games):
             for line in (f"  {verdict(event)}", f"    {event.reason}", event.remedy and f"    {event.remedy}"):
                 if line:
                     say(line)
@@ -290,29 +291,8 @@ def verdict(report: "VerdictReport") -> str:
     low, high = report.bounds
     games = f"after {report.games} games ({report.unique_games} unique), score {score}"
     place = f"LLR {report.llr:+.2f} in [{low:+.2f}, {high:+.2f}]"
-    gap = f", returns differ by {difference(report.difference)}" if report.difference else ""
-    anchors = "".join(f"; {wording.against_anchor(anchor, report.opponent, report.model)}" for anchor in report.anchors)
-    exploiters = "".join(
-        f"; {wording.against_exploiter(exploiter, report.opponent, report.model)}" for exploiter in report.exploiters
-    )
-    exploiters += "" if report.exploitability is None else f"; {_exploitability(report.exploitability, report.model)}"
+    gap = f", returns differ by {report.difference}" if report.difference else ""
+    further = "".join(f"; {test.finding}" for test in report.further)
     who = f"{short_verdict(report.verdict)}: {report.candidate} against {report.opponent}"
     forfeits = "".join(f"; {ref} forfeited {lost}" for ref, lost in report.forfeits.items())
-    return f"{who}: {report.outcome} {games}, {place}{gap}{anchors}{exploiters}{forfeits}"
-
-
-def _exploitability(test: "ExploitabilityReport", model: str) -> str:
-    """`not more exploitable than connect_four@1 by … after 600 games: a best response scores at least 0.48 (…), …`"""
-    sentence = wording.exploitability(test, model)
-    if test.candidate is None or test.champion is None or test.difference_over_exploiters is None:
-        return sentence
-    return (
-        f"{sentence}: a best response scores at least {test.candidate.bound:.3f} (that to {test.ref}:"
-        f" {test.champion.bound:.3f}), its exploiters achieve {difference(test.difference_over_exploiters)} more"
-    )
-
-
-def difference(gap: "Difference") -> str:
-    """`+1.5 [0.9, 2.1]`"""
-    span = "" if gap.low is None or gap.high is None else f" [{gap.low:.4g}, {gap.high:.4g}]"
-    return f"{gap.mean:+.4g}{span}"
+    return f"{who}: {report.outcome} {games}, {place}{gap}{further}{forfeits}"

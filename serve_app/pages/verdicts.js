@@ -51,9 +51,8 @@ export function Verdict({ league, verdict, about }) {
         <${Live}><a href=${query(leaguePath(league), { game: loaded.earlier_game })}>Show the results of that game</a><//></div>`}
       <${Evidence} verdict=${loaded} />
       <${Statistics} league=${league} verdict=${loaded} />
-      ${loaded.anchors?.length > 0 && html`<${Anchors} anchors=${loaded.anchors} />`}
-      ${loaded.exploiters?.length > 0 && html`<${Exploiters} exploiters=${loaded.exploiters} model=${loaded.model} />`}
-      ${loaded.exploitability && html`<${Exploitability} test=${loaded.exploitability} candidate=${loaded.candidate} model=${loaded.model} />`}
+      <${FurtherTests} verdict=${loaded} />
+      ${loaded.exploitability?.difference && html`<${Exploitability} test=${loaded.exploitability} />`}
       ${loaded.confirmation && html`<${Confirmation} match=${loaded.confirmation} />`}`}
     <//>
   </section>`;
@@ -101,44 +100,34 @@ function Counts({ counts }) {
     <span class="muted small">${name(index)}</span></li>`)}</ol>`;
 }
 
-function Anchors({ anchors }) {
-  return html`<h3>Non-inferiority tests</h3>
-    <${Table} caption="Non-inferiority tests" head=${[["Anchor"], ["Outcome"], ["Margin", "number"], ["Games", "number"], [html`<${Term} name="LLR" />`, "number"], ["Score", "number"], ["Champion’s score", "number"], ["Elo", "number"], ["95 % interval"]]}>
-      ${anchors.map((each) => html`<tr key=${each.schedule}><th scope="row"><span class="ref">${each.ref}</span></th><td>${each.outcome}</td><td class="number">${each.margin}</td>
-        <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${percent(each.score)}</td><td class="number">${percent(each.champion_score)}</td>
-        <td class="number">${signed(each.elo)}</td><td class="nowrap">${interval(each.interval)}</td></tr>`)}
-    <//>`;
-}
+/** A difference with its interval. */
+const spread = (difference) => html`${signed(difference.mean, 3)} <small>${number(difference.low, 3)} to ${number(difference.high, 3)}</small>`;
 
-/** The unit of the margins of tests with exploiters. */
-const marginUnit = (model) => (model === "returns" ? "in returns" : "of all points");
-
-function Exploiters({ exploiters, model }) {
-  const name = "Against exploiters, compared with the champion";
+/** The tests after that against the champion: of each kind, the document has those that were started. All have a finding. */
+function FurtherTests({ verdict }) {
+  const tests = Object.values(verdict).flat().filter((value) => value?.finding);
+  if (!tests.length) return null;
+  const name = "Further tests";
   return html`<h3>${name}</h3>
-    <${Table} caption=${name} head=${[["Exploiter"], ["Of"], ["Outcome"], [`Margin ${marginUnit(model)}`, "number"], ["Games", "number"], ["LLR", "number"], ["Score", "number"], ["Champion’s score", "number"], ["Difference", "number"]]}>
-      ${exploiters.map((each) => html`<tr key=${each.schedule}><th scope="row"><span class="ref">${each.ref}</span></th><td><span class="ref">${each.exploits}</span></td><td>${each.outcome}</td><td class="number">${each.margin}</td>
-        <td class="number">${count(each.games)}</td><td class="number">${number(each.llr)}</td><td class="number">${percent(each.score)}</td><td class="number">${percent(each.champion_score)}</td>
-        <td class="number">${each.difference && html`${signed(each.difference.mean, 3)} <small>${number(each.difference.low, 3)} to ${number(each.difference.high, 3)}</small>`}</td></tr>`)}
+    <${Table} caption=${name} head=${[["Opponent"], ["Finding"], [html`<${Term} name="LLR" />`, "number"], ["Score", "number"], ["Champion’s score", "number"], ["Difference", "number"], ["Elo", "number"]]}>
+      ${tests.map((test) => html`<tr key=${test.schedule}><th scope="row"><span class="ref">${test.ref}</span>${test.exploits && html` <small>exploiter of ${test.exploits}</small>`}</th>
+        <td>${test.finding}</td><td class="number">${number(test.llr)}</td><td class="number">${percent(test.score)}</td><td class="number">${percent(test.champion_score)}</td>
+        <td class="number">${test.difference && spread(test.difference)}</td><td class="number">${signed(test.elo)} ${test.interval && html`<small>${interval(test.interval)}</small>`}</td></tr>`)}
     <//>`;
 }
 
-function Exploitability({ test, candidate, model }) {
-  const bounds = [test.candidate, test.champion].filter(Boolean);
-  const rows = bounds.flatMap((side) => side.exploiters.map((each) => [side, each]));
-  const gap = (difference) => `${signed(difference.mean, 3)}${difference.low == null ? "" : ` (${signed(difference.low, 3)} to ${signed(difference.high, 3)})`}`;
+function Exploitability({ test }) {
+  const rows = [test.candidate, test.champion].flatMap((version) => version.exploiters.map((exploiter) => [version, exploiter]));
+  const others = test.difference_over_exploiters;
   const name = "Learned exploitability";
-  const isDecided = !["inconclusive", "open"].includes(test.outcome);
   return html`<h3>${name}</h3>
-    <p><span class="ref">${candidate}</span>: ${test.outcome} ${isDecided ? "than" : "compared with"} <span class="ref">${test.ref}</span>${isDecided && test.outcome !== "less exploitable" && ` by ${test.improvement || test.margin} ${marginUnit(model)}`} after ${count(test.games)} games, <${Term} name="LLR" /> ${number(test.llr)}.
-      ${bounds.map((side) => html` A best response to <span class="ref">${side.ref}</span> scores at least ${percent(side.bound)}.`)}</p>
-    ${test.difference && html`<p>The exploiters of the candidate achieve ${gap(test.difference)} more than those of the champion.
-      The 95 % interval is for these exploiters${test.difference_over_exploiters.low == null ? "" : `; for others that are trained in the same way: ${gap(test.difference_over_exploiters)}`}.</p>`}
-    ${rows.length > 0 && html`<${Table} caption=${name} head=${[["Version"], ["Exploiter"], ["Games", "number"], ["Score", "number"], ["95 % interval"], ["Return gain", "number"]]}>
-      ${rows.map(([side, each]) => html`<tr key=${each.ref}><th scope="row"><span class="ref">${side.ref}</span></th><td><span class="ref">${each.ref}</span></td>
-        <td class="number">${count(each.games)}</td><td class="number">${percent(each.score)}</td><td class="nowrap">${percent(each.low)} to ${percent(each.high)}</td>
-        <td class="number nowrap">${each.gain ? html`${signed(each.gain.mean, 2)} <small>${number(each.gain.low)} to ${number(each.gain.high)}</small>` : "–"}</td></tr>`)}
-    <//>`}`;
+    <p>The exploiters of the candidate achieve ${spread(test.difference)} more than those of the champion.
+      The 95 % interval is for these exploiters${others.low == null ? "" : html`; for others that are trained in the same way: ${spread(others)}`}.</p>
+    <${Table} caption=${name} head=${[["Version"], ["Exploiter"], ["Games", "number"], ["Score", "number"], ["95 % interval"], ["Return gain", "number"]]}>
+      ${rows.map(([version, exploiter]) => html`<tr key=${exploiter.ref}><th scope="row"><span class="ref">${version.ref}</span></th><td><span class="ref">${exploiter.ref}</span></td>
+        <td class="number">${count(exploiter.games)}</td><td class="number">${percent(exploiter.score)}</td><td class="nowrap">${percent(exploiter.low)} to ${percent(exploiter.high)}</td>
+        <td class="number nowrap">${exploiter.gain ? html`${signed(exploiter.gain.mean, 2)} <small>${number(exploiter.gain.low)} to ${number(exploiter.gain.high)}</small>` : "–"}</td></tr>`)}
+    <//>`;
 }
 
 function Confirmation({ match }) {

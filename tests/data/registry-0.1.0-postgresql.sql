@@ -355,7 +355,7 @@ INSERT INTO snapshots VALUES ('tictactoe', 'summary', '1; 3db8c2a09dcf; matches:
 INSERT INTO strengths VALUES ('tictactoe', 2, 'tictactoe@1', 'run', 2000, 100, 0.75, 0.6, 0.9, '2026-11-26 23:11:12.823557+00');
 INSERT INTO traffic_events VALUES (1, 'tictactoe', '2', 0.25, 'candidate', 0.5, 'ada', 'try it', '2026-11-26 23:11:12.68+00');
 INSERT INTO training_nights VALUES (1, 1, 'tictactoe', 1, '{"train": {"versions": ["tictactoe@2"], "start": 1}}', '2026-11-26 23:11:12.633051+00', '2026-11-26 23:11:12.655453+00');
-INSERT INTO verdicts VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 'tictactoe', 2, 'tictactoe@1', '{"gate": {"alpha": 0.01}, "night": 1, "anchors": [{"ref": "script:random", "margin": 0.1, "schedule": "tictactoe-round_robin-1", "mode": "no_worse"}], "exploiters": []}', 'promote', '{"promoted": true, "elo": 42.0}', '2026-11-26 23:11:12.56627+00', '2026-11-26 23:11:12.597234+00');
+INSERT INTO verdicts VALUES ('tictactoe-verdict-0123456789abcdef0123456789abcdef', 'tictactoe', 2, 'tictactoe@1', '{"gate": {"alpha": 0.01}, "night": 1, "tests": [{"kind": "anchor", "schedule": "tictactoe-round_robin-1", "ref": "script:random", "margin": 0.1, "mode": "no_worse"}]}', 'promote', '{"promoted": true, "elo": 42.0}', '2026-11-26 23:11:12.56627+00', '2026-11-26 23:11:12.597234+00');
 INSERT INTO version_notes VALUES (1, 'tictactoe', 1, 'the first', 'ada', '2026-11-26 23:11:12.275899+00');
 INSERT INTO versions VALUES ('tictactoe', 1, 'ready', 'run/1000', NULL, 'main', NULL, 'vm/b158714a-a379-48f9-8788-d6e901883539/4026531836:25746:409933', '2026-11-26 23:11:11.865805+00', '{
   "league": "tictactoe",

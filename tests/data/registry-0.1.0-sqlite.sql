@@ -322,7 +322,7 @@ CREATE TABLE verdicts (
 	CONSTRAINT pk_verdicts PRIMARY KEY (id), 
 	CONSTRAINT fk_verdicts_league_candidate FOREIGN KEY(league, candidate) REFERENCES versions (league, number)
 );
-INSERT INTO "verdicts" VALUES('tictactoe-verdict-0123456789abcdef0123456789abcdef','tictactoe',2,'tictactoe@1','{"gate": {"alpha": 0.01}, "night": 1, "anchors": [{"ref": "script:random", "margin": 0.1, "schedule": "tictactoe-round_robin-1", "mode": "no_worse"}], "exploiters": []}','promote','{"promoted": true, "elo": 42.0}','2026-11-26 23:11:12.566270','2026-11-26 23:11:12.597234');
+INSERT INTO "verdicts" VALUES('tictactoe-verdict-0123456789abcdef0123456789abcdef','tictactoe',2,'tictactoe@1','{"gate": {"alpha": 0.01}, "night": 1, "tests": [{"kind": "anchor", "schedule": "tictactoe-round_robin-1", "ref": "script:random", "margin": 0.1, "mode": "no_worse"}]}','promote','{"promoted": true, "elo": 42.0}','2026-11-26 23:11:12.566270','2026-11-26 23:11:12.597234');
 CREATE TABLE version_notes (
 	id INTEGER NOT NULL, 
 	league VARCHAR(255) NOT NULL, 

@@ -215,12 +215,12 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     dependents.aliases += session.scalars(
         select(AliasTable.name).filter_by(league=league, version=number).order_by(AliasTable.name)
     )
-    for verdict in session.scalars(select(VerdictRow).filter_by(league=league).order_by(VerdictRow.opened_at)):
-        if ref in verdict.contestants:
-            dependents.verdicts.append(verdict.id)
-            dependents.schedules |= set(verdict.schedules)
     documents = session.execute(select(ScheduleTable.id, ScheduleTable.document).filter_by(league=league))
     dependents.played = {id_ for id_, document in documents if ref in json.loads(document)["contestants"]}
+    for verdict in session.scalars(select(VerdictRow).filter_by(league=league).order_by(VerdictRow.opened_at)):
+        if not dependents.played.isdisjoint(verdict.schedules):
+            dependents.verdicts.append(verdict.id)
+            dependents.schedules |= set(verdict.schedules)
     dependents.played -= dependents.schedules
     matches = _count_matches(session, _matches_of(ref, dependents))
     children = session.scalars(_ready(league).filter_by(parent=number)).all()

@@ -20,9 +20,9 @@ from league.refs import short_verdict
 from league.registry.storage.manifest import EXPLOITER, MAIN, Manifest, Role
 from league.registry.storage.mixture import Mixture
 from league.registry.storage.tables import Base
-from league.verdict_tests import CompanionTests
 
 if TYPE_CHECKING:
+    from league.config.gate import GateConfig
     from league.config.league import LeagueConfig
 
 
@@ -366,25 +366,34 @@ class VerdictRow(Record, kw_only=True):
         return self.id
 
     @property
-    def companions(self) -> CompanionTests:
-        """Its tests after that against the champion."""
-        return CompanionTests.of_settings(self.settings)
+    def gate(self) -> "GateConfig":
+        """The gate's settings when it was opened, including its α."""
+        from league.config.gate import GateConfig
+
+        return GateConfig.model_validate(self.settings["gate"])
+
+    @property
+    def tests(self) -> list[dict[str, Any]]:
+        """The records of its tests after that against the champion, in the order in which they are played.
+
+        Each has a `kind` and a `schedule`, which is None until its opponents are trained.
+        """
+        return list(self.settings.get("tests", ()))
+
+    @property
+    def confirmation(self) -> str | None:
+        """Id of the schedule of its confirmation match, which has no influence on the decision."""
+        return self.settings.get("confirmation")
 
     @property
     def tested_schedules(self) -> list[str]:
         """Ids of the schedules whose results decide the verdict, in order."""
-        return [self.schedule, *(test.schedule for test in self.companions.ready)]
-
-    @property
-    def contestants(self) -> set[str]:
-        """References of all that play in its tests."""
-        return {self.candidate_ref, self.champion} | self.companions.opponents
+        return [self.schedule, *(test["schedule"] for test in self.tests if test["schedule"] is not None)]
 
     @property
     def schedules(self) -> list[str]:
         """Ids of all schedules that belong to the verdict."""
-        confirmation = self.companions.confirmation
-        return [*self.tested_schedules, *([confirmation] if confirmation else [])]
+        return [*self.tested_schedules, *([self.confirmation] if self.confirmation else [])]
 
     @property
     def short_id(self) -> str:
@@ -440,9 +449,9 @@ class TrainingNightRow(Record, kw_only=True):
     def start(self) -> int | None:
         """The version that its training started from, which may be another one than `parent`; None: from scratch.
 
-        `parent` before the end of training.
+        `parent` before the end of training, and if it never began.
         """
-        start: int | None = self.steps["train"]["start"] if "train" in self.steps else self.parent
+        start: int | None = self.steps.get("train", {}).get("start", self.parent)
         return start
 
     @property

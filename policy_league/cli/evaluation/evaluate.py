@@ -17,7 +17,7 @@ from policy_league.cli.options import (
     open_registry,
     workers_for,
 )
-from policy_league.cli.output import GameProgress, complain, difference, emit, say, show_leaderboard, table
+from policy_league.cli.output import GameProgress, complain, emit, say, show_leaderboard, table
 
 if TYPE_CHECKING:
     from evaluation.results import CrossPlay, Estimate, EvaluationReport, Population
@@ -138,7 +138,7 @@ def _show_payoff(report: "EvaluationReport") -> None:
     table(("", *names), [(name, *row) for name, row in zip(names, payoff.score, strict=True)])
     if report.scoring == "side":
         say("\nMean return of the row minus mean return of the column in the same blocks [95 %]:")
-        cells = [[None if gap is None else difference(gap) for gap in row] for row in payoff.difference]
+        cells = [[None if gap is None else str(gap) for gap in row] for row in payoff.difference]
         table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
 
 

@@ -22,12 +22,13 @@ from league.settings import Storage
 from policy_league.cli.evaluation.report import write_report
 from policy_league.cli.interrupt import exit_on_interrupt
 from policy_league.cli.options import CORES, AsJson, ClusterWorkers, EvaluationCluster, open_registry, workers_for
-from policy_league.cli.output import GameProgress, complain, console, difference, emit, say, show_leaderboard
+from policy_league.cli.output import GameProgress, complain, console, emit, say, show_leaderboard
 from policy_league.configs.bundled import find, names
 
 if TYPE_CHECKING:
+    from evaluation.gating.evidence import Confirmation
+    from evaluation.gating.nightly import NightlyReport
     from evaluation.gating.trained_exploiters import Trainer
-    from evaluation.results import Confirmation, NightlyReport
     from league.config.league import LeagueConfig
     from league.registry.registry import Registry
     from league.registry.storage.rows import TrainingNightRow
@@ -287,7 +288,7 @@ def summary_of_night(night: "TrainingNightRow") -> list[str]:
     sentences = [f"{night.league}: night {night.number} trained {', '.join(versions) or 'no version'} {start}."]
     if (exploitability := night.steps["measure"]["exploitability"]) is not None:
         best = exploitability["exploiters"][0]
-        gain = "" if best["gain"] is None else f", return gain {difference(Difference(**best['gain']))}"
+        gain = "" if best["gain"] is None else f", return gain {Difference(**best['gain'])}"
         sentences.append(
             f"{exploitability['ref']}: {best['ref']} scores {best['score']:.3f} [{best['low']:.3f}, {best['high']:.3f}]"
             f" against it{gain}. A best response scores at least {exploitability['bound']:.3f}."
@@ -325,7 +326,7 @@ def _change(report: "NightlyReport") -> str:
 def _gain(gain: "Confirmation") -> str:
     low, high = gain.interval
     interval = f"[{'−∞' if low is None else f'{low:+.0f}'}, {'+∞' if high is None else f'{high:+.0f}'}]"
-    returns = f", returns {difference(gain.difference)}" if gain.difference else ""
+    returns = f", returns {gain.difference}" if gain.difference else ""
     return (
         f"{gain.candidate} against {gain.opponent} in {gain.games} new games: {gain.elo:+.0f} Elo {interval}{returns}."
     )

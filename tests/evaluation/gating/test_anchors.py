@@ -10,11 +10,12 @@ from scipy.stats import binomtest
 from sqlalchemy import delete
 
 from benchmarks.simulations.exploiter_gates import against_anchor
+from evaluation.gating.criteria.anchor import resolve_anchors
+from evaluation.gating.evidence import VerdictReport
+from evaluation.gating.former_champions import earlier_champions
 from evaluation.gating.nightly import nightly
-from evaluation.gating.opponents import earlier_champions, resolve_anchors
 from evaluation.gating.verification import verify
 from evaluation.matches.tournament import evaluate
-from evaluation.results import VerdictReport
 from league.config.gate import GateConfig
 from league.config.league import LeagueConfig
 from league.errors import ConfigError, UnknownPolicy, VerdictRefuted
@@ -48,7 +49,10 @@ def promote(registry: Registry, *versions: int) -> None:
 def refs(registry: Registry, league: LeagueConfig, candidate: int, champion: str) -> list[str]:
     registry.leagues.register(league, registry.leagues.get(tictactoe.LEAGUE).interface)
     return [
-        anchor.ref for anchor in resolve_anchors(registry, registry.leagues.get(tictactoe.LEAGUE), candidate, champion)
+        anchor.ref
+        for anchor in resolve_anchors(
+            registry, registry.leagues.get(tictactoe.LEAGUE), f"tictactoe@{candidate}", champion
+        )
     ]
 
 
@@ -146,7 +150,10 @@ def test_a_candidate_that_passes_all_anchors_is_promoted_with_a_reason(registry:
     league = config(anchors=["script:random"], earlier_champions=1, margin=60)
     nightly(league, registry=registry)
     event = next(event for event in registry.aliases.history(tictactoe.LEAGUE) if event.version == 3)
-    assert "is not inferior to tictactoe@1, and does no worse than it against script:random" in event.reason
+    assert (
+        "and is at most 0.1 worse than the champion against script:random, and is at most 60 weaker than tictactoe@1"
+        in event.reason
+    )
     row = registry.verdicts.get(str(event.verdict))
     assert row.evidence is not None
     assert [anchor["outcome"] for anchor in row.evidence["anchors"]] == ["not worse", "not inferior"]
@@ -231,7 +238,10 @@ def test_a_bot_that_is_stronger_than_all_versions_blocks_no_progress(
         assert (anchor.mode, anchor.outcome, anchor.margin, anchor.elo) == ("no_worse", "not worse", 0.1, None)
         assert anchor.champion_score < anchor.score - 0.1
         assert anchor.difference.mean == pytest.approx(anchor.score - anchor.champion_score)
-        assert f"does no worse than it against {BOT}" in registry.aliases.history(tictactoe.LEAGUE)[0].reason
+        assert (
+            f"is at most 0.1 worse than the champion against {BOT}"
+            in registry.aliases.history(tictactoe.LEAGUE)[0].reason
+        )
     assert verify(verdict.verdict, registry=registry, replays=4).outcome == outcome
     registry.close()
 

@@ -1,5 +1,6 @@
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from evaluation.gating.gate import SequentialMonitor, decide, decide_matches, shadow_shortfall
-from evaluation.gating.sequential_tests import SequentialTest
+from evaluation.gating.gate import SequentialMonitor, SequentialTest, decide, decide_matches, observe, shadow_shortfall
 from evaluation.matches.game_records import unique_games
 from evaluation.statistics.sequential import bounds, elo_estimate, expected_games, gsprt_llr
 from league.config.gate import GateConfig
@@ -230,3 +230,38 @@ def test_without_requirements_there_is_no_shortfall() -> None:
 def test_each_requirement_is_independent() -> None:
     assert shadow_shortfall(GateConfig(shadow_agreement=0.5), 1000, 0, 0.6, 99.0) is None
     assert shadow_shortfall(GateConfig(latency_ms=1), 1000, 0, 0.0, 0.5) is None
+
+
+def block(contestants: tuple[str, str], score: float) -> Match:
+    """A block in which the first contestant has this score in both games."""
+    games = tuple(Game((i, 1 - i), 1, (), (), (score, -score), (score, 1 - score)) for i in (0, 1))
+    return Match("s/0", "league", "s", 0, contestants, 1, "digest", games)
+
+
+def round_of(own: tuple[float, ...], other: tuple[float, ...]) -> list[Match]:
+    """A round in which candidate and champion have these scores against their exploiters."""
+    pairs = zip(own, other, strict=True)
+    return [block((who, f"{who}-{i}"), s) for i, both in enumerate(pairs) for who, s in zip("ab", both, strict=True)]
+
+
+def test_a_round_is_one_observation_of_mean_scores() -> None:
+    matches = [*round_of((1.0, 0.5), (0.0, 0.5)), *round_of((0.0, 0.0), (1.0, 0.5))]
+    test = SequentialTest(GateConfig(), "a", "b", pairs=2)
+    observations = observe(test, matches)
+    assert observations.scores == pytest.approx([0.5 + 0.25, 0.5 - 0.375])
+    assert observations.gaps == pytest.approx([0.5, -0.75])
+    assert (observations.comparisons, test.matches_each) == (8, 4)
+    decision = decide_matches(replace(test, settings=GateConfig().compared_with_champion(0.1)), matches)
+    assert (decision.blocks, decision.games, len(decision.counts)) == (2, 16, 17)
+
+
+def test_an_incomplete_round_is_ignored() -> None:
+    matches = round_of((1.0, 0.5), (0.0, 0.5))
+    for end in range(4):
+        assert observe(SequentialTest(GateConfig(), "a", "b", pairs=2), matches[:end]).scores == []
+
+
+def test_differences_of_returns_are_means_of_a_round() -> None:
+    returns = GateConfig(model="returns", return_bound=2, margin=0.5)
+    observations = observe(SequentialTest(returns, "a", "b", pairs=2), round_of((1.0, 0.5), (0.0, 0.5)))
+    assert observations.gaps == pytest.approx([1.0])

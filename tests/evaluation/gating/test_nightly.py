@@ -13,11 +13,12 @@ import pytest
 from filelock import FileLock
 
 from evaluation.gating import verdicts
-from evaluation.gating.nightly import nightly
+from evaluation.gating.evidence import VerdictReport
+from evaluation.gating.nightly import NightlyReport, nightly
 from evaluation.gating.verification import verify
 from evaluation.matches import tournament
 from evaluation.matches.leaderboard import CountedGames
-from evaluation.results import NightlyReport, Progress, VerdictReport
+from evaluation.results import Progress
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import AlreadyRunning, ConfigError
@@ -191,7 +192,7 @@ from league.registry.registry import Registry
 from league.registry.verdicts import VerdictRepository
 from league.settings import Storage
 from evaluation.gating.nightly import nightly
-from evaluation.results import VerdictReport
+from evaluation.gating.evidence import VerdictReport
 from tests.support.leagues.judged_league import CONFIG
 
 verdicts = 0
@@ -473,7 +474,7 @@ def test_purged_games_are_kept_but_ignored(judged: Registry) -> None:
     verdicts.void(judged, first.id, actor="me", reason="a broken machine", purge=True)
     row = judged.verdicts.get(first.id)
     assert row.outcome == "void"
-    own = [row.schedule, row.companions.confirmation, *(anchor.schedule for anchor in row.companions.anchors)]
+    own = [row.schedule, row.confirmation, *(test["schedule"] for test in row.tests)]
     played = sum(len(Ledger(judged).positions(schedule)) for schedule in own)
     assert len(Ledger(judged).results(tictactoe.LEAGUE)) == number - played
     assert len(Ledger(judged).matches(league=tictactoe.LEAGUE, schedule=row.schedule)) >= first.evidence["blocks"]
@@ -493,7 +494,7 @@ def test_a_promotion_is_confirmed_by_new_games_of_fixed_number(registry: Registr
         assert high is not None
         assert low < gain.elo < high
         row = registry.verdicts.get(verdict.verdict)
-        fresh = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.companions.confirmation)
+        fresh = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.confirmation)
         counted = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.schedule)
         assert {match.seed for match in fresh}.isdisjoint(match.seed for match in counted)
     assert nightly(CONFIG, registry=registry).confirmations == ()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from evaluation.matches import tournament
 from evaluation.matches.tournament import chunks_of, evaluate, play_schedule
 from evaluation.matches.worker import match_worker
-from evaluation.results import Progress, VerdictReport
+from evaluation.results import Progress
 from league.errors import (
     ArtifactCorrupt,
     ConfigError,
@@ -73,7 +73,7 @@ def test_it_stops_when_enough_is_true(registry: Registry) -> None:
 
 
 def test_progress_is_reported(registry: Registry) -> None:
-    events: list[Progress | VerdictReport] = []
+    events: list[Progress] = []
     schedule = tournament_schedule(registry)
     play_schedule(schedule, registry=registry, listener=events.append)
     reports = [event for event in events if isinstance(event, Progress)]
@@ -129,7 +129,7 @@ def test_ray_plays_the_same_matches(registry: Registry) -> None:
 @pytest.mark.usefixtures("ray_session")
 def test_without_a_number_of_workers_all_cpus_of_the_cluster_play(registry: Registry) -> None:
     """Tests have one node with two CPUs."""
-    events: list[Progress | VerdictReport] = []
+    events: list[Progress] = []
     schedule = tournament_schedule(registry)
     play_schedule(schedule, registry=registry, workers=None, listener=events.append)
     reports = [event for event in events if isinstance(event, Progress)]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from evaluation.gating.verdict_evidence import verdict_evidence
+from evaluation.gating.evidence import verdict_of
 from evaluation.gating.verdicts import open_verdict, void
 from evaluation.matches.game_records import unique_games
 from evaluation.matches.leaderboard import MAX_UPSETS, compute_leaderboard
@@ -108,7 +108,7 @@ def test_each_verdict_has_its_evidence(registry: Registry) -> None:
     rows, events = registry.verdicts.all(LEAGUE), registry.aliases.history(LEAGUE)
     assert registry.snapshots.marks(LEAGUE).keys() == PARTS | {f"verdict/{row.id}" for row in rows}
     for row in rows:
-        evidence = verdict_evidence(registry, row, events).to_json()
+        evidence = verdict_of(registry, row).to_json()
         assert row.evidence is not None
         assert (evidence["outcome"], evidence["promoted"]) == (row.outcome, row.evidence["promoted"])
         assert (evidence["llr"], evidence["blocks"]) == (row.evidence["llr"], row.evidence["blocks"])
@@ -250,14 +250,14 @@ def test_a_failing_verdict_does_not_affect_the_others(
             open_verdict(registry, registry.leagues.get(LEAGUE), 1, "script:random"),
             open_verdict(registry, registry.leagues.get(LEAGUE), 1, "script:one_ply"),
         )
-        compute_evidence = snapshots.verdict_evidence
+        compute_evidence = snapshots.verdict_of
 
-        def fail_for_second(registry: Registry, verdict: Any, events: Any) -> Any:
+        def fail_for_second(registry: Registry, verdict: Any) -> Any:
             if verdict.id == second.id:
                 raise ZeroDivisionError
-            return compute_evidence(registry, verdict, events)
+            return compute_evidence(registry, verdict)
 
-        monkeypatch.setattr(snapshots, "verdict_evidence", fail_for_second)
+        monkeypatch.setattr(snapshots, "verdict_of", fail_for_second)
         with caplog.at_level(logging.ERROR):
             refresh(registry, LEAGUE)
         assert registry.snapshots.marks(LEAGUE).keys() == PARTS | {f"verdict/{first.id}"}

@@ -20,9 +20,8 @@ from sqlalchemy import update
 
 from benchmarks.harness import CONFIGS
 from benchmarks.leagues.served_league import builder
-from evaluation.gating.gate import decide_matches
-from evaluation.gating.sequential_tests import SequentialTest
-from evaluation.gating.verdicts import conclude, gate_of, open_verdict
+from evaluation.gating.gate import SequentialTest, decide_matches
+from evaluation.gating.verdicts import conclude, open_verdict
 from evaluation.matches.tournament import evaluate
 from evaluation.schedules.builders import gauntlet, round_robin
 from evaluation.service.snapshots import refresh
@@ -114,7 +113,7 @@ class _Crowd:
             self._registry, league, number, f"{LEAGUE}@{champion}" if champion else "script:random", alpha=0.05
         )
         drawn = list(self._drawn(self._ledger.schedule(verdict.schedule), CONFIG.gate.max_blocks))
-        self._write(drawn[: decide_matches(SequentialTest(gate_of(verdict), new), drawn).blocks], number, hour=1)
+        self._write(drawn[: decide_matches(SequentialTest(verdict.gate, new), drawn).blocks], number, hour=1)
         conclude(self._registry, verdict)
         self._date(verdict.id, number)
         opponents = [f"{LEAGUE}@{n}" for n in range(max(1, number - NEIGHBOURS), number)]

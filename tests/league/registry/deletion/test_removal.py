@@ -13,7 +13,6 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, RunPoint, StrengthRow
 from league.registry.storage.tables import Base
 from league.results.ledger import Ledger
-from league.verdict_tests import AnchorTest, CompanionTests, ExploitabilityTest
 from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
 from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered
@@ -21,8 +20,7 @@ from tests.support.leagues.registries import LEAGUE, leftovers, publish, registe
 OTHER = "another"
 VERDICT = f"{LEAGUE}-verdict-0f3a62d1c8b45e97-1b2c3d4e"
 ANCHOR = f"{LEAGUE}-anchor-77c01d2e"
-TESTS = CompanionTests(anchors=(AnchorTest(f"{LEAGUE}@1", 50.0, ANCHOR),))
-SETTINGS: dict[str, Any] = {"gate": {"alpha": 0.05}} | TESTS.to_settings()
+SETTINGS: dict[str, Any] = {"gate": {"alpha": 0.05}, "tests": [{"kind": "anchor", "schedule": ANCHOR}]}
 
 
 @pytest.fixture
@@ -112,9 +110,10 @@ def test_a_version_without_dependents_is_removed_and_its_number_is_not_reused(us
 def test_exploiters_that_were_trained_for_a_verdict_are_in_use(used: Registry) -> None:
     publish(used, "run/4")
     verdict = f"{LEAGUE}-verdict-1f3a62d1c8b45e97-1b2c3d4e"
-    test = ExploitabilityTest((f"{LEAGUE}@4",), (), margin=0.1, blocks=20, schedule=f"{LEAGUE}-exploitability-1")
-    tests = replace(TESTS, exploitability=test)
-    used.verdicts.open(LEAGUE, 3, f"{LEAGUE}@2", verdict, SETTINGS | tests.to_settings())
+    schedule = f"{LEAGUE}-exploitability-1"
+    Ledger(used).open(replace(SCHEDULE, id=schedule, league=LEAGUE, contestants=(f"{LEAGUE}@3", f"{LEAGUE}@4")))
+    tests = [{"kind": "exploitability", "schedule": schedule}]
+    used.verdicts.open(LEAGUE, 3, f"{LEAGUE}@2", verdict, SETTINGS | {"tests": tests})
     used.verdicts.close(verdict, "reject", {})
     with pytest.raises(Conflict, match=r"1 verdict \(1f3a62d1\)"):
         used.removal.remove_version(CheckpointRef(LEAGUE, 4))

@@ -22,7 +22,6 @@ from league.registry.storage.rows import Portion
 from league.registry.storage.tables import Base
 from league.results.ledger import Ledger
 from league.settings import Storage
-from league.verdict_tests import AnchorTest
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
 from tests.support.leagues.registries import LEAGUE, interface, publish
 
@@ -134,7 +133,8 @@ def test_what_version_0_1_0_wrote_is_read(storage: Storage) -> None:
         assert (rollback.kind, rollback.version, start.actor, start.reason) == ("rollback", 1, "ada", "the first")
         verdict = registry.verdicts.get(str(promotion.verdict))
         assert (verdict.outcome, verdict.candidate, verdict.evidence) == ("promote", 2, {"promoted": True, "elo": 42.0})
-        assert verdict.companions.anchors == (AnchorTest("script:random", 0.1, SCHEDULE.id, "no_worse"),)
+        assert [(test["kind"], test["ref"]) for test in verdict.tests] == [("anchor", "script:random")]
+        assert verdict.tested_schedules == [verdict.schedule, SCHEDULE.id]
         (run,) = registry.nightly_runs.all(LEAGUE)
         assert (run.candidates, run.alpha, run.report) == ((2,), 0.01, {"champion": "tictactoe@2"})
         (night,) = registry.training_nights.all(LEAGUE)
