@@ -18,9 +18,9 @@ from rich.console import Console
 
 from benchmarks.harness import CONFIGS, Target
 from benchmarks.training.learned import one_thread, two_at_once
+from evaluation.documents import ExploiterScore
 from evaluation.gating.criteria.exploitability import exploitability
 from evaluation.matches.worker import MatchWorker
-from evaluation.results import ExploiterScore
 from evaluation.schedules.builders import gauntlet
 from evaluation.statistics.payoff import score_interval
 from league.config.league import LeagueConfig

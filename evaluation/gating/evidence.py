@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from evaluation.documents import Difference, Document, Forfeits, iso_timestamp
 from evaluation.gating.criteria.anchor import AnchorReport, AnchorTest
 from evaluation.gating.criteria.champion import ChampionTest
 from evaluation.gating.criteria.criterion import Contest, Criterion, elo_statistics, statistics
@@ -14,7 +15,6 @@ from evaluation.gating.criteria.exploiter import ExploiterReport, ExploiterTest
 from evaluation.gating.gate import cell_counts
 from evaluation.gating.gate_result import CriterionReport, CriterionResult, GateResult
 from evaluation.matches.game_records import forfeits, forfeits_of_all
-from evaluation.results import Difference, Document, Forfeits, iso_timestamp
 from evaluation.statistics.payoff import paired_difference
 from evaluation.statistics.sequential import elo_estimate
 from league.registry.changes import OPEN

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from evaluation.documents import Document
 from evaluation.gating.gate import Decision, Outcome
-from evaluation.results import Document
 from league.config.gate import GateConfig
 
 MOST_GAMES = 1_000_000

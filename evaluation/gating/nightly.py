@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+from evaluation.documents import Document, Progress, Standing
 from evaluation.gating import verdicts
 from evaluation.gating.criteria.criterion import Contest
 from evaluation.gating.evidence import Confirmation, VerdictReport, confirmation
@@ -21,7 +22,6 @@ from evaluation.gating.trained_exploiters import Trainer, check_exploiters
 from evaluation.matches import tournament
 from evaluation.matches.leaderboard import compute_leaderboard
 from evaluation.matches.tournament import fixed_baselines
-from evaluation.results import Document, Progress, Standing
 from evaluation.schedules.builders import ANCHOR, gauntlet
 from evaluation.statistics.alpha_spending import alpha_share, alpha_spent
 from league.config.league import LeagueConfig

@@ -16,6 +16,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from evaluation.documents import Listener, Progress
 from evaluation.gating.criteria.criterion import Contest, Criterion
 from evaluation.gating.evidence import (
     CRITERIA,
@@ -31,7 +32,6 @@ from evaluation.gating.gate import SequentialMonitor, shadow_shortfall
 from evaluation.gating.gate_result import GateResult
 from evaluation.gating.trained_exploiters import Trainer
 from evaluation.matches import tournament
-from evaluation.results import Listener, Progress
 from evaluation.schedules.builders import companion
 from evaluation.schedules.builders import verdict as verdict_schedule
 from league.errors import AliasMoved

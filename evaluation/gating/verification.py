@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.documents import Document
 from evaluation.gating.criteria.criterion import Contest
 from evaluation.gating.evidence import evidence, gate_result
 from evaluation.playback.replay import replay
-from evaluation.results import Document
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, InvalidInput, LedgerConflict, VerdictRefuted
 from league.registry.registry import Registry

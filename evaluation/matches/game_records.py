@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from hashlib import blake2b
 
-from evaluation.results import Document, Forfeits
+from evaluation.documents import Document, Forfeits
 from evaluation.statistics.sequential import score_of
 from league.results.records import Game, Match
 

@@ -6,8 +6,8 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 
+from evaluation.documents import Payoff, RatedVersion, Standing, iso_timestamp
 from evaluation.matches.game_records import Upset, UpsetFinder, identity
-from evaluation.results import Payoff, RatedVersion, Standing, iso_timestamp
 from evaluation.schedules.builders import ANCHOR
 from evaluation.statistics.bradley_terry import Rating, rate
 from evaluation.statistics.payoff import only_side, tabulate

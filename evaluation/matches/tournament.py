@@ -23,10 +23,10 @@ from typing import Generic, TypeVar, get_args
 import ray
 from ray.exceptions import RayError, RayTaskError
 
+from evaluation.documents import EvaluationReport, Listener, Progress, StoppedBy
 from evaluation.matches.game_records import forfeits_of_all, unique_games
 from evaluation.matches.leaderboard import by_side, rank_contestants
 from evaluation.matches.worker import match_worker, num_envs
-from evaluation.results import EvaluationReport, Listener, Progress, StoppedBy
 from evaluation.schedules.builders import ANCHOR
 from evaluation.schedules.tournament_plan import (
     DEFAULT_BLOCKS,

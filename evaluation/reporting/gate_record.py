@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from evaluation.results import Standing
+from evaluation.documents import Standing
 from league.refs import CHAMPION, CheckpointRef, parse_ref
 from league.registry.registry import Registry
 from league.registry.storage.rows import VerdictRow, VersionRow

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from evaluation.results import Document
+from evaluation.documents import Document
 from evaluation.statistics.payoff import score_interval
 from league.errors import InvalidInput
 from league.registry.registry import Registry

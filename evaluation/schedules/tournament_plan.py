@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from evaluation.results import StoppedBy
+from evaluation.documents import StoppedBy
 from evaluation.schedules.builders import (
     ANCHOR,
     adaptive_name,

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from evaluation.documents import iso_timestamp
 from evaluation.matches.leaderboard import CountedGames
-from evaluation.results import iso_timestamp
 from evaluation.statistics.population import shares
 from league.conditions import Conditions, GameChange, game_changes
 from league.registry.registry import Registry

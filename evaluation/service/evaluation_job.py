@@ -20,10 +20,10 @@ from typing import Any, Self
 
 from ray.exceptions import RayError
 
+from evaluation.documents import EvaluationReport, Progress
 from evaluation.gating.evidence import VerdictReport
 from evaluation.gating.nightly import NightlyListener, NightlyReport, nightly
 from evaluation.matches.tournament import evaluate
-from evaluation.results import EvaluationReport, Progress
 from evaluation.schedules.tournament_plan import Budget
 from evaluation.service.evaluation_supervisor import EvaluationJobOptions
 from league.errors import LeagueError, StorageError, one_line, to_document

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
-from evaluation.results import CrossPlay, Difference, Estimate, Payoff
+from evaluation.documents import CrossPlay, Difference, Estimate, Payoff
 from league.results.records import Game, Match
 
 Floats = NDArray[np.float64]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evaluation.results import Document, Estimate, Payoff, Population
+from evaluation.documents import Document, Estimate, Payoff, Population
 from evaluation.statistics.payoff import Floats
 from league.results.equilibria import alpha_rank, nash_averaging
 from league.results.records import Match

@@ -17,10 +17,10 @@ from rich.text import Text
 from league.refs import short_verdict
 
 if TYPE_CHECKING:
+    from evaluation.documents import Progress as Games
+    from evaluation.documents import Standing
     from evaluation.gating.evidence import VerdictReport
     from evaluation.gating.nightly import NightlyListener
-    from evaluation.results import Progress as Games
-    from evaluation.results import Standing
     from league.registry.registry import Registry
 
 console = Console(highlight=False)
@@ -243,7 +243,7 @@ class GameProgress:
     def _show(self, event: "Games | VerdictReport") -> None:
         if self._quiet:
             return
-        from evaluation.results import Progress as Games
+        from evaluation.documents import Progress as Games
 
         if not isinstance(event, Games):
             for line in (f"  {verdict(event)}", f"    {event.reason}", event.remedy and f"    {event.remedy}"):

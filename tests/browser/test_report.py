@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from evaluation.results import Difference
+from evaluation.documents import Difference
 from league.registry.registry import Registry
 from policy_league.cli.evaluation.report_contents import MOST_BYTES, MOST_VERDICTS, league_report
 from policy_league.cli.evaluation.report_file import report_file

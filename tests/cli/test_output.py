@@ -4,7 +4,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
-from evaluation.results import Progress
+from evaluation.documents import Progress
 from policy_league.cli import output
 
 

@@ -18,8 +18,8 @@ import pytest
 from filelock import FileLock
 from websockets.exceptions import ConnectionClosed
 
+from evaluation.documents import EvaluationReport
 from evaluation.matches.tournament import evaluate
-from evaluation.results import EvaluationReport
 from league.client import Client, Stream
 from league.client.stream_protocol import StreamProtocol
 from league.policies.onnx import OnnxPolicy

@@ -1,7 +1,7 @@
 """Reports of tests of exploitability, without games."""
 
+from evaluation.documents import Difference, Exploitability, ExploiterScore
 from evaluation.gating.criteria.exploitability import ExploitabilityReport
-from evaluation.results import Difference, Exploitability, ExploiterScore
 
 
 def exploitability_report(exploiters: int) -> ExploitabilityReport:

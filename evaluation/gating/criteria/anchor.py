@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Self
 
+from evaluation.documents import Difference
 from evaluation.gating.criteria.criterion import (
     Contest,
     Criterion,
@@ -23,7 +24,6 @@ from evaluation.gating.criteria.criterion import (
 from evaluation.gating.former_champions import earlier_champions
 from evaluation.gating.gate import Decision, SequentialTest, decide_matches
 from evaluation.gating.gate_result import CriterionReport, CriterionResult
-from evaluation.results import Difference
 from evaluation.schedules.builders import companion, paired_test
 from evaluation.statistics.sequential import score_at
 from league.config.gate import AnchorConfig, AnchorMode, GateConfig

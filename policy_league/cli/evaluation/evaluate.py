@@ -20,7 +20,7 @@ from policy_league.cli.options import (
 from policy_league.cli.output import GameProgress, complain, emit, say, show_leaderboard, table
 
 if TYPE_CHECKING:
-    from evaluation.results import CrossPlay, Estimate, EvaluationReport, Population
+    from evaluation.documents import CrossPlay, Estimate, EvaluationReport, Population
     from league.registry.registry import Registry
 
 

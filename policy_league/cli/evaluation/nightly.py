@@ -281,7 +281,7 @@ def faults_of(night: "TrainingNightRow") -> list[str]:
 
 def summary_of_night(night: "TrainingNightRow") -> list[str]:
     """Summarise a night of training: what was trained, and how exploitable the champion is."""
-    from evaluation.results import Difference
+    from evaluation.documents import Difference
 
     versions = night.steps["train"]["versions"]
     start = "from scratch" if night.start is None else f"from {night.league}@{night.start}"

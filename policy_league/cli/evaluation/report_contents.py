@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 
 from evaluation.matches.leaderboard import MOST_CONTESTANTS
-from evaluation.results import iso_timestamp
+from evaluation.documents import iso_timestamp
 from evaluation.service.game_worker import GameWorker
 from evaluation.service.snapshots import refresh
 from league.errors import AlreadyRunning

@@ -12,13 +12,14 @@ from typing import Any
 import pytest
 from filelock import FileLock
 
+from evaluation.documents import Progress
 from evaluation.gating import verdicts
 from evaluation.gating.evidence import VerdictReport
 from evaluation.gating.nightly import NightlyReport, nightly
 from evaluation.gating.verification import verify
 from evaluation.matches import tournament
 from evaluation.matches.leaderboard import CountedGames
-from evaluation.results import Progress
+from evaluation.documents import Progress
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import AlreadyRunning, ConfigError

@@ -11,10 +11,10 @@ import ray
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evaluation.documents import Progress
 from evaluation.matches import tournament
 from evaluation.matches.tournament import chunks_of, evaluate, play_schedule
 from evaluation.matches.worker import match_worker
-from evaluation.results import Progress
 from league.errors import (
     ArtifactCorrupt,
     ConfigError,
@@ -226,7 +226,7 @@ KILLED = """
 import os, signal, sys
 from league.registry.registry import Registry
 from league.settings import Storage
-from evaluation.results import Progress
+from evaluation.documents import Progress
 from evaluation.matches.tournament import play_schedule
 from tests.support.leagues.tournaments import tournament_schedule
 

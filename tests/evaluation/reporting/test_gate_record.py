@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from evaluation.documents import Standing
 from evaluation.gating.verdicts import open_verdict, void
 from evaluation.matches.tournament import evaluate
 from evaluation.reporting.gate_record import doubts, why_not_champion
-from evaluation.results import Standing
 from league.registry.registry import Registry
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, WEAK, league_of
