@@ -10,8 +10,8 @@ from typing import Any
 
 import httpx
 
-from evaluation.matches.leaderboard import MOST_CONTESTANTS
 from evaluation.documents import iso_timestamp
+from evaluation.matches.leaderboard import MOST_CONTESTANTS
 from evaluation.service.game_worker import GameWorker
 from evaluation.service.snapshots import refresh
 from league.errors import AlreadyRunning

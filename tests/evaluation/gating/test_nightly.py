@@ -19,7 +19,6 @@ from evaluation.gating.nightly import NightlyReport, nightly
 from evaluation.gating.verification import verify
 from evaluation.matches import tournament
 from evaluation.matches.leaderboard import CountedGames
-from evaluation.documents import Progress
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import AlreadyRunning, ConfigError

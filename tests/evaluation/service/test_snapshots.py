@@ -105,7 +105,7 @@ def test_the_leaderboard_and_the_payoffs_are_those_of_the_ledger(registry: Regis
 
 
 def test_each_verdict_has_its_evidence(registry: Registry) -> None:
-    rows, events = registry.verdicts.all(LEAGUE), registry.aliases.history(LEAGUE)
+    rows = registry.verdicts.all(LEAGUE)
     assert registry.snapshots.marks(LEAGUE).keys() == PARTS | {f"verdict/{row.id}" for row in rows}
     for row in rows:
         evidence = verdict_of(registry, row).to_json()
