@@ -24,11 +24,11 @@ from benchmarks.load import http as load
 from benchmarks.load import websocket as stream_load
 from benchmarks.parity import prepare, situations
 from benchmarks.training.learned import local_ray
-from league.client.requests import encode
 from league.policies import load as load_policy
 from league.registry.registry import Registry
 from league.registry.storage.manifest import TRAINING
 from league.registry.storage.rows import VersionRow
+from policy_league_client.requests import encode
 from serve_app.inference.stream_codec import encode_request
 from serve_app.runtime import haproxy
 from serve_app.runtime.launch import running

@@ -1,4 +1,4 @@
-"""Generates the blocking client, league/client/_sync, from the asyncio client, league/client/_async.
+"""Generates the blocking client, `policy_league_client._sync`, from the asyncio client, `_async`.
 
     python scripts/generate_sync_client.py [--check]
 
@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-SOURCE = ROOT / "league/client/_async"
-TARGET = ROOT / "league/client/_sync"
+PACKAGE = ROOT / "clients/python/policy_league_client"
+SOURCE, TARGET = PACKAGE / "_async", PACKAGE / "_sync"
 RULES = (
     (r"\basync (?=def|for|with)", ""),
     (r"\bawait ", ""),

@@ -8,7 +8,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("policy_league", "evaluation", "training", "serve_app", "league")
+PACKAGES = ("policy_league", "evaluation", "training", "serve_app", "league", "clients/python/policy_league_client")
 HEAD = """# Modules
 
 All Python modules, by package. In each package the sub-packages are listed from the highest layer to the lowest: a

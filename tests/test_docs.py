@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,10 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
 PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.rglob("*.md"))]
-PACKAGES = ("evaluation", "league", "policy_league", "serve_app", "training")
-FOLDERS = (*PACKAGES, "benchmarks", "deploy", "docs", "scripts", "tests")
+PACKAGES = {name: ROOT / name for name in ("evaluation", "league", "policy_league", "serve_app", "training")} | {
+    "policy_league_client": ROOT / "clients/python/policy_league_client"
+}
+FOLDERS = (*PACKAGES, "benchmarks", "clients", "deploy", "docs", "scripts", "tests")
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
@@ -201,8 +204,8 @@ def test_each_training_setting_is_documented_with_its_default(name: str) -> None
 def test_each_module_is_in_the_module_index() -> None:
     files = {
         name_of(path)
-        for package in PACKAGES
-        for path in (ROOT / package).rglob("*.py")
+        for package in PACKAGES.values()
+        for path in package.rglob("*.py")
         if path.name != "__init__.py" and path.parent.parent.name != "migrations"
     }
     listed = re.findall(r"^\| `([\w/]+\.py)` \| \S", MODULE_INDEX(), flags=re.M)
@@ -213,7 +216,8 @@ def test_each_module_is_in_the_module_index() -> None:
 def top_level_names(module: Path) -> set[str]:
     """Names defined at the top level of a module, and those that it imports."""
     names = set()
-    for node in ast.parse(module.read_text()).body:
+    top_level = ast.parse(module.read_text()).body
+    for node in [*top_level, *chain.from_iterable(node.body for node in top_level if isinstance(node, ast.If))]:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             names.add(node.name)
         elif isinstance(node, ast.ImportFrom | ast.Import):
@@ -229,7 +233,7 @@ def exists(dotted: str) -> bool:
     """Whether a dotted name is a package, a module, or defined in one."""
     parts = dotted.split(".")
     for length in range(len(parts), 0, -1):
-        path = ROOT.joinpath(*parts[:length])
+        path = PACKAGES.get(parts[0], ROOT / parts[0]).joinpath(*parts[1:length])
         module = path.with_suffix(".py") if path.with_suffix(".py").exists() else path / "__init__.py"
         if module.exists():
             rest = parts[length:]
@@ -328,8 +332,8 @@ def test_no_page_uses_a_retired_term(page: Path) -> None:
 
 def test_each_environment_variable_of_ours_is_documented() -> None:
     used = set()
-    for package in PACKAGES:
-        for path in (ROOT / package).rglob("*.py"):
+    for package in PACKAGES.values():
+        for path in package.rglob("*.py"):
             used |= set(re.findall(r"\bLEAGUE_[A-Z_]+\b", path.read_text()))
     listed = re.findall(r"^\| `(LEAGUE_\w+)` \|", (DOCS / "environment-variables.md").read_text(), flags=re.M)
     assert sorted(listed) == sorted(used)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES
 from benchmarks.load.elsewhere import Stage
 from benchmarks.load.http import drive
-from league.client import AsyncClient
 from league.errors import LeagueError
+from policy_league_client import AsyncClient
 
 CALLERS = 4
 """Callers of each kind. Each calls again as soon as it has an answer."""

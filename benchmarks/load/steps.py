@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES
 from benchmarks.load.elsewhere import Stage
 from benchmarks.load.http import drive
-from league.client import AsyncClient
 from league.errors import LeagueError
+from policy_league_client import AsyncClient
 
 CONNECTIONS = 16
 CLIENTS, INTERVAL = 4, 0.4

@@ -1,8 +1,3 @@
-"""Python client for a policy server: `Client` blocks, `AsyncClient` is its asyncio counterpart."""
+"""The Python client, which is also installed without the rest of the project: `policy_league_client`."""
 
-from league.client._async.client import AsyncClient as AsyncClient
-from league.client._async.episode import AsyncEpisode as AsyncEpisode
-from league.client._async.stream import AsyncStream as AsyncStream
-from league.client._sync.client import Client as Client
-from league.client._sync.episode import Episode as Episode
-from league.client._sync.stream import Stream as Stream
+from policy_league_client import *

@@ -10,9 +10,6 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from league.client import Client
-from league.client.calls import ApiCall
-from league.client.requests import JsonObject, to_json
 from league.errors import ConfigError, EnvironmentMismatch, RemoteError
 from league.interface import AgentInterface, Interface, digest
 from league.policies.actions import bounds
@@ -21,6 +18,9 @@ from league.policies.open_inference_signature import DATATYPES, RemoteSignature,
 from league.policies.policy import Actions, Arrays, MalformedAction
 from league.refs import RemoteRef
 from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete, inputs
+from policy_league_client import Client
+from policy_league_client.calls import ApiCall
+from policy_league_client.requests import JsonObject, to_json
 
 KEY_VARIABLE = "LEAGUE_REMOTE_API_KEY"
 """Environment variable with the API keys for servers of remote models: `SERVER=KEY`, separated by spaces."""

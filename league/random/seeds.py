@@ -1,8 +1,6 @@
 """Derives seeds and random generators from a recorded seed and a path."""
 
-import zlib
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -10,15 +8,9 @@ from numpy.random.bit_generator import ISeedSequence
 from numpy.typing import NDArray
 
 from league.random.seed_sequence import generate_state
-
-
-def derive(seed: int, *path: int | str) -> int:
-    """Return a seed in [0, 2^63) that depends on `seed` and on each part of `path`.
-
-    Uses NumPy's SeedSequence (O'Neill's seed_seq), whose outputs for different spawn keys are independent.
-    """
-    state = _sequence(seed, path).generate_state(1, np.uint64)[0]
-    return int(state) >> 1
+from policy_league_client.seeds import derive as derive
+from policy_league_client.seeds import sequence
+from policy_league_client.seeds import spawn_key as spawn_key
 
 
 def derive_each(seed: int, numbers: Sequence[int]) -> NDArray[np.int64]:
@@ -30,7 +22,7 @@ def derive_each(seed: int, numbers: Sequence[int]) -> NDArray[np.int64]:
 
 def generator(seed: int, *path: int | str) -> np.random.Generator:
     """Return the random generator of `path` below `seed`."""
-    return np.random.Generator(np.random.PCG64(_sequence(seed, path)))
+    return np.random.Generator(np.random.PCG64(sequence(seed, path)))
 
 
 def generators(seeds: NDArray[np.int64], *path: int | str | NDArray[np.int64]) -> list[np.random.Generator]:
@@ -50,14 +42,3 @@ class _Computed(ISeedSequence):
         """Return the four words that PCG64 asks for."""
         assert (n_words, dtype) == (4, np.uint64)
         return self._state
-
-
-# The seed of a match is derived several times.
-@lru_cache(maxsize=4096)
-def _sequence(seed: int, path: tuple[int | str, ...]) -> np.random.SeedSequence:
-    return np.random.SeedSequence(seed, spawn_key=spawn_key(*path))
-
-
-def spawn_key(*path: Any) -> list[Any]:
-    """Return the numbers that stand for a path in NumPy's SeedSequence. Parts may be arrays."""
-    return [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in path]

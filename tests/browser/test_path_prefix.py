@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from league.client import Client
+from policy_league_client import Client
 from serve_app.runtime import serve_bypass
 from tests.support.clients.browsers import Served, Tab
 from tests.support.leagues import tictactoe

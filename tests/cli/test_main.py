@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import typer
 
-from league.client import Client
 from league.registry.registry import Registry
 from policy_league.cli.main import SUBCOMMANDS, app
+from policy_league_client import Client
 from tests.support.command import League
 
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -95,7 +95,7 @@ def test_an_unusable_home_is_reported_in_one_line(league: League, home: Path) ->
 def test_an_unreachable_server_is_reported_in_one_line(
     league: League, registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("league.client.Client", partial(Client, retry_deadline=0.5))
+    monkeypatch.setattr("policy_league_client.Client", partial(Client, retry_deadline=0.5))
     result = league("act", "tictactoe@1", "--url", "http://127.0.0.1:9")
     assert result.code == 1
     assert result.err.count("\n") == 1

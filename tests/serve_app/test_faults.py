@@ -13,9 +13,9 @@ import httpx
 import pytest
 
 from benchmarks.load.http import post
-from league.client import Client
 from league.registry.registry import Registry
 from league.settings import Storage
+from policy_league_client import Client
 from serve_app.runtime.launch import running
 from tests.support.attacks.slow_clients import slow_clients
 from tests.support.clients.actions import BOARD

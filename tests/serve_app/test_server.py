@@ -20,8 +20,6 @@ from websockets.exceptions import ConnectionClosed
 
 from evaluation.documents import EvaluationReport
 from evaluation.matches.tournament import evaluate
-from league.client import Client, Stream
-from league.client.stream_protocol import StreamProtocol
 from league.policies.onnx import OnnxPolicy
 from league.policies.open_inference import OpenInferencePolicy
 from league.refs import RemoteRef
@@ -30,6 +28,8 @@ from league.registry.storage.rows import Portion
 from league.results.ledger import Ledger
 from league.results.records import Match
 from league.settings import Storage
+from policy_league_client import Client, Stream
+from policy_league_client.stream_protocol import StreamProtocol
 from serve_app.runtime import haproxy
 from serve_app.runtime.launch import running
 from tests.support.clients.actions import BOARD

@@ -6,13 +6,10 @@ from pathlib import Path
 
 from ray.exceptions import RayActorError, RayTaskError
 
-import training
-from league.errors import LeagueError, one_line
+from league.errors import OWN_PACKAGES, LeagueError, one_line
 from training.rllib_compat import remote_traceback
 
 FRAME_LINE = re.compile(r'^\s*File "(?P<file>.+)", line (?P<line>\d+), in ', re.MULTILINE)
-ROOT = Path(training.__file__).parent.parent
-OWN_PATHS = ("<", *(f"{ROOT}/{package}/" for package in ("league", "training", "policy_league")))
 LIBRARY_PATHS = ("-packages/", "/lib/python")
 RAY_PATH = "-packages/ray/"
 
@@ -32,7 +29,7 @@ def training_error(error: BaseException, league: str, trace: Path) -> LeagueErro
     frames = [
         f"{match['file']}:{match['line']}"
         for match in FRAME_LINE.finditer("\n".join(tracebacks))
-        if not match["file"].startswith(OWN_PATHS) and RAY_PATH not in match["file"]
+        if not match["file"].startswith(("<", *OWN_PACKAGES.values())) and RAY_PATH not in match["file"]
     ]
     # The last frame in the user's code, otherwise in a library.
     theirs = [frame for frame in frames if not any(part in frame for part in LIBRARY_PATHS)]

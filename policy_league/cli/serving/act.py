@@ -60,7 +60,7 @@ def _ask(
     import httpx
     import numpy as np
 
-    from league.client import Client
+    from policy_league_client import Client
 
     model = str(PolicyRef(ref.league, policy))
     try:

@@ -11,10 +11,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient, WebSocketDenialResponse, WebSocketTestSession
 
-from league.client.endpoint import Endpoint
-from league.client.requests import ActionRequest
-from league.client.responses import parse_model
-from league.client.stream_protocol import StreamProtocol
 from league.errors import InvalidInput
 from league.policies.loading import load
 from league.policies.onnx import OnnxPolicy
@@ -22,6 +18,10 @@ from league.registry.registry import Registry
 from league.registry.storage.mixture import Mixture
 from league.registry.storage.rows import Portion
 from league.settings import Storage
+from policy_league_client.endpoint import Endpoint
+from policy_league_client.requests import ActionRequest
+from policy_league_client.responses import parse_model
+from policy_league_client.stream_protocol import StreamProtocol
 from tests.support.clients.actions import BOARD, act, boards
 from tests.support.leagues.served_leagues import everything, promote, publish
 from tests.support.policies.graphs import counting, masked_mlp, memoryless

@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from league.client import Client
+from policy_league_client import Client
 from tests.support.servers.replicas import READ_ONLY
 
 SETTINGS = READ_ONLY.model_copy(update={"max_body": 512 * 1024})

@@ -15,9 +15,9 @@ from typing import Any
 import httpx
 import numpy as np
 
-from league.client import Client
 from league.errors import LeagueError
 from league.files import replacing
+from policy_league_client import Client
 
 BOARD = {"observation": np.zeros((3, 3, 2), np.int8), "action_mask": np.ones(9, np.int8)}
 BODY = {"observation": {name: value.tolist() for name, value in BOARD.items()}}

@@ -12,18 +12,18 @@ import httpx
 import orjson
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
-from league.client.endpoint import Endpoint
-from league.client.requests import ActionRequest, BatchActionRequest, to_json
-from league.client.responses import (
+from policy_league_client.endpoint import Endpoint
+from policy_league_client.errors import BodyTooLarge, LeagueError, RemoteError, Unauthenticated, one_line
+from policy_league_client.refs import CHAMPION
+from policy_league_client.requests import ActionRequest, BatchActionRequest, to_json
+from policy_league_client.responses import (
     ActionResponse,
     BatchActionResponse,
     Model,
     parse_action_response,
     parse_batch_action_response,
 )
-from league.client.retries import Outcome, Retries, parse_error
-from league.errors import BodyTooLarge, LeagueError, RemoteError, Unauthenticated, one_line
-from league.refs import CHAMPION
+from policy_league_client.retries import Outcome, Retries, parse_error
 
 OK = 200
 PERMANENT_CLOSE_CODES: dict[int, type[LeagueError]] = {

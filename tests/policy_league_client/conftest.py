@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from league.client import AsyncClient, Client
 from league.registry.registry import Registry
 from league.settings import Storage
+from policy_league_client import AsyncClient, Client
 from tests.support.clients.sync_and_async import SETTINGS, Connect, Synchronous
 from tests.support.leagues.protocol_leagues import every_kind
 from tests.support.leagues.served_leagues import everything

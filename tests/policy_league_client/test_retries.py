@@ -9,9 +9,9 @@ from typing import Any
 import httpx
 import pytest
 
-from league.client import retries
-from league.client.retries import Retries
 from league.errors import DeadlineExceeded, NotReady, Overloaded, RateLimited, RemoteError
+from policy_league_client import retries
+from policy_league_client.retries import Retries
 from tests.support.clients.sync_and_async import Connect
 
 DROP, NO_RESPONSE = 0, 1

@@ -11,8 +11,6 @@ from gymnasium.spaces import Box, Discrete
 from pettingzoo import ParallelEnv
 from pettingzoo.classic import rps_v2, tictactoe_v3
 
-from league.client import Client
-from league.client.pettingzoo import Step, play
 from league.errors import InvalidInput, UnknownLeague
 from league.interface import AgentInterface
 from league.policies.onnx import OnnxPolicy
@@ -22,6 +20,8 @@ from league.settings import Storage
 from league.spaces import Box as BoxSpace
 from league.spaces import DictSpace
 from league.spaces import Discrete as DiscreteSpace
+from policy_league_client import Client
+from policy_league_client.pettingzoo import Step, play
 from tests.support.leagues.protocol_leagues import CHOICE, table
 from tests.support.leagues.served_leagues import everything, promote, publish, register
 from tests.support.policies.graphs import masked_mlp

@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import orjson
 
-from league.errors import BY_CODE, InvalidInput, LeagueError, NoReplica, RateLimited, RemoteError
+from policy_league_client.errors import BY_CODE, InvalidInput, LeagueError, NoReplica, RateLimited, RemoteError
 
 INITIAL_DELAY = 0.01
 """Seconds before the second attempt; doubled before each further attempt."""

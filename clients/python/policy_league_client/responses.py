@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from league.errors import ArtifactCorrupt, UnknownVersion, VersionRetired
-from league.refs import PolicyRef, parse_version
+from policy_league_client.errors import ArtifactCorrupt, UnknownVersion, VersionRetired
+from policy_league_client.refs import PolicyRef, parse_version
 
 VERSION_GONE = (VersionRetired, UnknownVersion, ArtifactCorrupt)
 """Errors for a version that is not available any more."""

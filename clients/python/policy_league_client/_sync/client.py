@@ -1,4 +1,4 @@
-# Generated from league/client/_async/client.py by scripts/generate_sync_client.py; do not edit.
+# Generated from clients/python/policy_league_client/_async/client.py by scripts/generate_sync_client.py; do not edit.
 """HTTP client for a policy server: actions, episodes, streams, versions, promotions and evaluations."""
 
 import time
@@ -7,17 +7,17 @@ from typing import Any, Self, TypeVar
 
 import httpx
 
-from league.client import calls
-from league.client._sync.episode import Episode
-from league.client._sync.stream import Stream
-from league.client.calls import ANY, ApiCall, Promotion
-from league.client.endpoint import DEFAULT_URL, LIMITS, Endpoint
-from league.client.requests import ActionRequest, BatchActionRequest, Encoding, JsonObject
-from league.client.responses import ActionResponse, BatchActionResponse, parse_model
-from league.client.retries import POLL_INTERVAL, Outcome, Retries
-from league.client.transport import sleep
-from league.errors import LeagueError, NotReady
-from league.refs import CHAMPION
+from policy_league_client import calls
+from policy_league_client._sync.episode import Episode
+from policy_league_client._sync.stream import Stream
+from policy_league_client.calls import ANY, ApiCall, Promotion
+from policy_league_client.endpoint import DEFAULT_URL, LIMITS, Endpoint
+from policy_league_client.errors import LeagueError, NotReady
+from policy_league_client.refs import CHAMPION
+from policy_league_client.requests import ActionRequest, BatchActionRequest, Encoding, JsonObject
+from policy_league_client.responses import ActionResponse, BatchActionResponse, parse_model
+from policy_league_client.retries import POLL_INTERVAL, Outcome, Retries
+from policy_league_client.transport import sleep
 
 T = TypeVar("T")
 
@@ -38,7 +38,7 @@ class Client:
         retry_deadline: Seconds after the first attempt within which a failed request is retried if the server was
             unreachable or busy; 0 disables retries. Every request is safe to repeat: requests that change something
             carry an `Idempotency-Key`.
-        encoding: Encoding of arrays in requests; see `league.client.requests.Encoding`.
+        encoding: Encoding of arrays in requests; see `policy_league_client.requests.Encoding`.
 
     Raises:
         InvalidInput: The URL, the key, the caller or the timeout is invalid.

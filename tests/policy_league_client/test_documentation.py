@@ -17,7 +17,7 @@ from tests.support.leagues.served_leagues import BOARD, promote, publish, regist
 from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.streaming import listening
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 URL = "http://127.0.0.1:8000"
 
 

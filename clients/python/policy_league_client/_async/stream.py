@@ -1,4 +1,3 @@
-# Generated from league/client/_async/stream.py by scripts/generate_sync_client.py; do not edit.
 """WebSocket streams for programs that need an action at every tick: one message in each direction per action.
 
 A stream connects at the first action and reconnects whenever the connection is lost, for example because its replica
@@ -8,23 +7,23 @@ shuts down (close code 1012). Its version and its recurrent state survive a reco
 from collections.abc import Sequence
 from typing import Any, Self
 
-from league.client.endpoint import Endpoint
-from league.client.requests import ActionRequest, BatchActionRequest, Encoding
-from league.client.responses import ActionResponse, BatchActionResponse, Model
-from league.client.retries import Outcome, Retries
-from league.client.stream_protocol import CONNECTION_ERRORS, StreamProtocol
-from league.client.transport import (
-    Cancelled,
-    Connection,
-    connect,
-    receive,
-    sleep,
-    time_limit,
+from policy_league_client.endpoint import Endpoint
+from policy_league_client.requests import ActionRequest, BatchActionRequest, Encoding
+from policy_league_client.responses import ActionResponse, BatchActionResponse, Model
+from policy_league_client.retries import Outcome, Retries
+from policy_league_client.stream_protocol import CONNECTION_ERRORS, StreamProtocol
+from policy_league_client.transport import (
+    AsyncCancelled,
+    AsyncConnection,
+    async_connect,
+    async_receive,
+    async_sleep,
+    async_time_limit,
 )
 
 
-class Stream:
-    """A WebSocket stream, created by `Client.stream`. Do not share it between threads or tasks.
+class AsyncStream:
+    """A WebSocket stream, created by `AsyncClient.stream`. Do not share it between threads or tasks.
 
     Args:
         endpoint: The server.
@@ -42,7 +41,7 @@ class Stream:
         self._retry_deadline = retry_deadline
         self._encoding: Encoding = encoding
         self._protocol = StreamProtocol(endpoint, model, follow)
-        self._connection: Connection | None = None
+        self._connection: AsyncConnection | None = None
 
     @property
     def version(self) -> int | None:
@@ -54,7 +53,7 @@ class Stream:
         """The last response; None before the first action."""
         return self._protocol.last
 
-    def act(
+    async def act(
         self,
         observation: Any,
         *,
@@ -66,10 +65,10 @@ class Stream:
         """Request the action for one observation.
 
         Args:
-            observation: See `Client.act`.
+            observation: See `AsyncClient.act`.
             reset: Start an episode with this observation: the recurrent state is reset.
-            explore: See `Client.act`.
-            seed: See `Client.act`.
+            explore: See `AsyncClient.act`.
+            seed: See `AsyncClient.act`.
             probabilities: Include the action probabilities in the response, which is available as `last`.
 
         Returns:
@@ -77,16 +76,16 @@ class Stream:
 
         Raises:
             VersionRetired: The stream had to reconnect, and its version is not served any more.
-            LeagueError: See `Client`.
+            LeagueError: See `AsyncClient`.
         """
         request = ActionRequest.build(
             observation, self._encoding, explore=explore, seed=seed, probabilities=probabilities
         )
-        self._send(request, reset)
+        await self._send(request, reset)
         assert isinstance(self.last, ActionResponse)
         return self.last.action
 
-    def act_batch(
+    async def act_batch(
         self,
         observations: Any,
         *,
@@ -98,9 +97,9 @@ class Stream:
         """Request the actions for a batch of observations.
 
         Args:
-            observations: See `Client.act_batch`.
+            observations: See `AsyncClient.act_batch`.
             reset: Start an episode in every row, or in the rows that are True.
-            explore: See `Client.act`.
+            explore: See `AsyncClient.act`.
             seed: One seed for the batch, or one for each observation.
             probabilities: See `act`.
 
@@ -113,47 +112,47 @@ class Stream:
         request = BatchActionRequest.build(
             observations, self._encoding, explore=explore, seed=seed, probabilities=probabilities
         )
-        self._send(request, reset if isinstance(reset, bool) else list(reset))
+        await self._send(request, reset if isinstance(reset, bool) else list(reset))
         assert isinstance(self.last, BatchActionResponse)
         return self.last.actions
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """Close the connection. The next action opens a new one."""
         connection, self._connection = self._connection, None
         if connection is not None:
-            connection.close()
+            await connection.close()
 
-    def __enter__(self) -> Self:
+    async def __aenter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
 
-    def _send(self, request: ActionRequest | BatchActionRequest, reset: bool | list[bool]) -> None:
+    async def _send(self, request: ActionRequest | BatchActionRequest, reset: bool | list[bool]) -> None:
         retries = Retries(self._retry_deadline)
-        while (delay := self._protocol.next_delay(retries, self._attempt(request, reset))) is not None:
-            sleep(delay)
+        while (delay := self._protocol.next_delay(retries, await self._attempt(request, reset))) is not None:
+            await async_sleep(delay)
 
-    def _attempt(self, request: ActionRequest | BatchActionRequest, reset: bool | list[bool]) -> Outcome:
+    async def _attempt(self, request: ActionRequest | BatchActionRequest, reset: bool | list[bool]) -> Outcome:
         timeout = self._endpoint.timeout
         try:
-            with time_limit(timeout):
-                connection = self._connection or self._open()
-                connection.send(self._protocol.message(request, reset))
+            async with async_time_limit(timeout):
+                connection = self._connection or await self._open()
+                await connection.send(self._protocol.message(request, reset))
                 while True:
-                    outcome = self._protocol.receive(request, receive(connection, timeout))
+                    outcome = self._protocol.receive(request, await async_receive(connection, timeout))
                     if outcome is not None:
                         return outcome
         except CONNECTION_ERRORS as error:
             # On the same connection, a late response would be taken for the response to the next message.
-            self.close()
+            await self.close()
             return self._protocol.connection_lost(error)
-        except Cancelled:
-            self.close()  # for the same reason
+        except AsyncCancelled:
+            await self.close()  # for the same reason
             raise
 
-    def _open(self) -> Connection:
-        self._connection = connect(self._protocol.url, self._endpoint.headers, self._endpoint.timeout)
+    async def _open(self) -> AsyncConnection:
+        self._connection = await async_connect(self._protocol.url, self._endpoint.headers, self._endpoint.timeout)
         assert self._connection.response is not None
         self._protocol.opened(self._connection.response.headers)
         return self._connection

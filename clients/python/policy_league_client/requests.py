@@ -20,7 +20,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from league.errors import InvalidInput
+from policy_league_client.errors import InvalidInput
 
 Encoding = Literal["base64", "png", "lists"]
 """Encoding of arrays in requests.

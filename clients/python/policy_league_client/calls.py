@@ -5,16 +5,16 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
-from league.client.requests import ActionRequest, BatchActionRequest, JsonObject, to_json
-from league.client.responses import (
+from policy_league_client.errors import AliasMoved, InvalidInput
+from policy_league_client.refs import CheckpointRef, check_alias, check_slug, is_mixture, parse_mixture
+from policy_league_client.requests import ActionRequest, BatchActionRequest, JsonObject, to_json
+from policy_league_client.responses import (
     ActionResponse,
     BatchActionResponse,
     Model,
     parse_action_response,
     parse_batch_action_response,
 )
-from league.errors import AliasMoved, InvalidInput
-from league.refs import CheckpointRef, check_alias, check_slug, is_mixture, parse_mixture
 
 T = TypeVar("T")
 

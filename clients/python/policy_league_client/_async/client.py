@@ -6,17 +6,17 @@ from typing import Any, Self, TypeVar
 
 import httpx
 
-from league.client import calls
-from league.client._async.episode import AsyncEpisode
-from league.client._async.stream import AsyncStream
-from league.client.calls import ANY, ApiCall, Promotion
-from league.client.endpoint import DEFAULT_URL, LIMITS, Endpoint
-from league.client.requests import ActionRequest, BatchActionRequest, Encoding, JsonObject
-from league.client.responses import ActionResponse, BatchActionResponse, parse_model
-from league.client.retries import POLL_INTERVAL, Outcome, Retries
-from league.client.transport import async_sleep
-from league.errors import LeagueError, NotReady
-from league.refs import CHAMPION
+from policy_league_client import calls
+from policy_league_client._async.episode import AsyncEpisode
+from policy_league_client._async.stream import AsyncStream
+from policy_league_client.calls import ANY, ApiCall, Promotion
+from policy_league_client.endpoint import DEFAULT_URL, LIMITS, Endpoint
+from policy_league_client.errors import LeagueError, NotReady
+from policy_league_client.refs import CHAMPION
+from policy_league_client.requests import ActionRequest, BatchActionRequest, Encoding, JsonObject
+from policy_league_client.responses import ActionResponse, BatchActionResponse, parse_model
+from policy_league_client.retries import POLL_INTERVAL, Outcome, Retries
+from policy_league_client.transport import async_sleep
 
 T = TypeVar("T")
 
@@ -37,7 +37,7 @@ class AsyncClient:
         retry_deadline: Seconds after the first attempt within which a failed request is retried if the server was
             unreachable or busy; 0 disables retries. Every request is safe to repeat: requests that change something
             carry an `Idempotency-Key`.
-        encoding: Encoding of arrays in requests; see `league.client.requests.Encoding`.
+        encoding: Encoding of arrays in requests; see `policy_league_client.requests.Encoding`.
 
     Raises:
         InvalidInput: The URL, the key, the caller or the timeout is invalid.

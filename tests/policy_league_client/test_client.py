@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from league.client import AsyncClient, Client
 from league.errors import (
     AliasMoved,
     BodyTooLarge,
@@ -28,6 +27,7 @@ from league.errors import (
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
+from policy_league_client import AsyncClient, Client
 from serve_app.models.traffic_split import key_position
 from tests.support.clients.sync_and_async import Connect
 from tests.support.policies.graphs import masked_mlp

@@ -1,4 +1,4 @@
-# Generated from league/client/_async/episode.py by scripts/generate_sync_client.py; do not edit.
+# Generated from clients/python/policy_league_client/_async/episode.py by scripts/generate_sync_client.py; do not edit.
 """Episodes over HTTP, in which one version chooses every action.
 
 The first response determines the version. Later requests specify that version and return the recurrent state.
@@ -6,11 +6,11 @@ The first response determines the version. Later requests specify that version a
 
 from typing import Any, Protocol, Self, TypeVar
 
-from league.client import calls
-from league.client.calls import ApiCall
-from league.client.requests import ActionRequest, Encoding
-from league.client.responses import VERSION_GONE, ActionResponse, Model, episode_interrupted
-from league.random.seeds import derive
+from policy_league_client import calls
+from policy_league_client.calls import ApiCall
+from policy_league_client.requests import ActionRequest, Encoding
+from policy_league_client.responses import VERSION_GONE, ActionResponse, Model, episode_interrupted
+from policy_league_client.seeds import derive
 
 T = TypeVar("T")
 

@@ -6,9 +6,9 @@ from typing import Any, TypeVar
 
 import httpx
 
-from league.client.calls import ApiCall
-from league.client.retries import Outcome, parse_error, parse_object
-from league.errors import InvalidInput, RemoteError, one_line
+from policy_league_client.calls import ApiCall
+from policy_league_client.errors import InvalidInput, RemoteError, one_line
+from policy_league_client.retries import Outcome, parse_error, parse_object
 
 T = TypeVar("T")
 

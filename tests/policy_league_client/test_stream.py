@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from websockets.sync.server import Server, ServerConnection, serve
 
-from league.client import AsyncClient
 from league.errors import (
     BodyTooLarge,
     InvalidInput,
@@ -23,6 +22,7 @@ from league.errors import (
     VersionRetired,
 )
 from league.registry.registry import Registry
+from policy_league_client import AsyncClient
 from tests.support.clients.actions import BOARD, boards
 from tests.support.clients.sync_and_async import SETTINGS, Connect
 from tests.support.leagues.served_leagues import promote
