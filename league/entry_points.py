@@ -11,11 +11,12 @@ import os
 import sys
 from collections.abc import Iterable, Sequence
 from importlib.util import module_from_spec
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from league.environment_code import environment_code, module_in
-from league.errors import ConfigError, raised_at
+from league.errors import OWN_PACKAGES, ConfigError, raised_at
 
 _folders: list[str] = []
 
@@ -42,6 +43,7 @@ def import_module(key: str, name: str, folder: str | None = None) -> ModuleType:
     """
     folders = _folders if folder is None else [folder]
     try:
+        _check_name(key, name, folders)
         _check_files(key, name, folder)
         _import_own(key, name.partition(".")[0], folders)
         module = importlib.import_module(name)
@@ -50,6 +52,7 @@ def import_module(key: str, name: str, folder: str | None = None) -> ModuleType:
     except ConfigError:
         raise
     except ImportError as error:
+        _check_name(key, error.name or "", [*folders, os.getcwd()])
         working = [os.getcwd()] if {os.getcwd(), ""} & set(sys.path) else []
         searched = ", ".join(dict.fromkeys([*folders, *working, "installed packages"]))
         raise ConfigError(f"{key}: cannot import {name!r}: {_reason(error)}; searched: {searched}") from error
@@ -84,6 +87,17 @@ def missing(module: ModuleType, name: str) -> str:
     return f"{module.__name__!r} ({getattr(module, '__file__', 'built in')}) has no {name!r}{guess}"
 
 
+def _check_name(key: str, name: str, folders: Iterable[str]) -> None:
+    """Raise ConfigError if a module of the user is hidden by a package of this project, such as `training`."""
+    package = name.partition(".")[0]
+    for folder in folders if package in OWN_PACKAGES else ():
+        module, path = Path(folder, *name.split(".")), Path(folder, package)
+        if module.is_dir() or module.with_suffix(".py").is_file():
+            path = path if path.is_dir() else path.with_suffix(".py")
+            if not path.samefile(OWN_PACKAGES[package]):
+                raise ConfigError(f"{key}: {path} has the name of a package of Policy League: rename it")
+
+
 def _check_files(key: str, name: str, folder: str | None) -> None:
     """Raise ConfigError if this process has imported another file than that of the league, for it or what it imports.
 
@@ -92,6 +106,7 @@ def _check_files(key: str, name: str, folder: str | None) -> None:
     if folder is None or module_in(folder, name.partition(".")[0]) is None:
         return
     for module, file in environment_code(name, folder).files.items():
+        _check_name(key, module, [folder])
         loaded = getattr(sys.modules.get(module), "__file__", None)
         if loaded is not None and os.path.realpath(loaded) != os.path.realpath(file):
             raise ConfigError(_several(key, module, (file, loaded)))

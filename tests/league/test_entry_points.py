@@ -124,6 +124,44 @@ def test_the_folder_is_no_part_of_the_game(tmp_path: Path) -> None:
     assert str(tmp_path) not in first.environment.model_dump_json()
 
 
+@pytest.mark.parametrize("is_package", [True, False], ids=["package", "folder"])
+@pytest.mark.parametrize(
+    ("module", "text"),
+    [
+        ("training.envs", GAME),
+        ("own_game", "from training.envs import make_env"),
+        ("own_game", "from training import envs"),
+    ],
+)
+def test_a_folder_with_the_name_of_one_of_our_packages_is_to_be_renamed(
+    tmp_path: Path, module: str, text: str, is_package: bool
+) -> None:
+    folder = tmp_path / "training"
+    folder.mkdir()
+    if is_package:
+        (folder / "__init__.py").touch()
+    (folder / "envs.py").write_text(GAME)
+    write(tmp_path, text=text)
+    with pytest.raises(ConfigError) as raised:
+        import_entry_point("environment.entry_point", f"{module}:make_env", str(tmp_path))
+    assert str(raised.value) == (
+        f"environment.entry_point: {folder} has the name of a package of Policy League: rename it"
+    )
+
+
+def test_a_module_with_the_name_of_one_of_our_packages_is_to_be_renamed(tmp_path: Path) -> None:
+    config = LeagueConfig.load(write(tmp_path, "evaluation"))
+    with pytest.raises(ConfigError, match=rf"{tmp_path}/evaluation\.py has the name of a package of Policy League"):
+        build(config.environment)
+
+
+def test_our_own_packages_are_not_to_be_renamed_in_a_clone() -> None:
+    root = str(Path(__file__).parents[2])
+    assert import_entry_point("key", "policy_league.examples.two_step:AGENTS", root)
+    with pytest.raises(ConfigError, match=r"No module named 'training\.missing'"):
+        import_module("key", "training.missing", root)
+
+
 def test_an_import_error_names_line_and_searched_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     config = LeagueConfig.load(write(tmp_path / "project", text="\nimport own_missing\n"))
