@@ -9,7 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("league", "training", "evaluation", "serve_app", "policy_league/cli", "benchmarks", "tests/support")
+PACKAGES = (
+    "benchmarks",
+    "clients/python/policy_league_client",
+    "evaluation",
+    "league",
+    "policy_league",
+    "serve_app",
+    "tests/support",
+    "training",
+)
 GENERATED = ("_pb2.py", "_sync", "migrations")
 VAGUE = frozenset(("found", "seen", "each", "own", "shown", "wanted", "given", "here", "now", "this", "that", "others"))
 VAGUE |= {"rest", "mine", "known", "chosen", "taken", "begun"}

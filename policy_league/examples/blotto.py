@@ -15,7 +15,7 @@ from pettingzoo import ParallelEnv
 
 AGENTS = ("player_0", "player_1")
 COINS, FIELDS = 10, 3
-DIVISIONS = np.array([each for each in product(range(COINS + 1), repeat=FIELDS) if sum(each) == COINS])
+DIVISIONS = np.array([coins for coins in product(range(COINS + 1), repeat=FIELDS) if sum(coins) == COINS])
 """Coins on each field, (actions, fields)."""
 PAYOFF = np.sign(np.sign(DIVISIONS[:, np.newaxis] - DIVISIONS).sum(axis=2)).astype(np.float64)
 """What an action wins against each other one, (actions, actions)."""

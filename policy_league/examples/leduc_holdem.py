@@ -45,14 +45,14 @@ class LeducWithHistory(raw_env):
 
     def observe(self, agent: str) -> dict[str, NDArray]:
         """Return the information state of an agent, and its action mask."""
-        seen = super().observe(agent)
-        return seen | {"observation": np.concatenate([seen["observation"], self._history.ravel()])}
+        stock = super().observe(agent)
+        return stock | {"observation": np.concatenate([stock["observation"], self._history.ravel()])}
 
     def render_for(self, agent: str) -> NDArray:
         """Render the table as a player sees it, with the opponent's card face down: (height, width, 3) uint8."""
-        game, own = self.env.game, self._name_to_int(agent)
+        game, viewer = self.env.game, self._name_to_int(agent)
         state_of = game.get_state
-        game.get_state = lambda player: state_of(player) | ({} if player == own else {"hand": CARD_BACK})
+        game.get_state = lambda player: state_of(player) | ({} if player == viewer else {"hand": CARD_BACK})
         try:
             return np.array(self.render())
         finally:
@@ -60,8 +60,8 @@ class LeducWithHistory(raw_env):
 
     def step(self, action: int | None) -> None:
         if action is not None:
-            seen = self.observe(self.agent_selection)["observation"]
-            current = int(seen[FIRST_PUBLIC_CARD : FIRST_PUBLIC_CARD + 3].any())
+            observation = self.observe(self.agent_selection)["observation"]
+            current = int(observation[FIRST_PUBLIC_CARD : FIRST_PUBLIC_CARD + 3].any())
             self._history[current, int(self._history[current].sum()), action] = 1
         super().step(action)
 

@@ -34,7 +34,7 @@ class LeducWithHistoryVector(LeducHoldem):
 
     def _rows(self, env_ids: NDArray[np.int64]) -> Sequence[AgentRows]:
         (rows,) = super()._rows(env_ids)
-        seen, history = rows.observations[OBSERVATION], self._history[rows.envs].reshape(len(rows.envs), -1)
-        self._round[rows.envs] = seen[:, FIRST_PUBLIC_CARD : FIRST_PUBLIC_CARD + 3].any(axis=1)
-        states = np.concatenate([seen, history], axis=1)
+        stock, history = rows.observations[OBSERVATION], self._history[rows.envs].reshape(len(rows.envs), -1)
+        self._round[rows.envs] = stock[:, FIRST_PUBLIC_CARD : FIRST_PUBLIC_CARD + 3].any(axis=1)
+        states = np.concatenate([stock, history], axis=1)
         return (replace(rows, observations={**rows.observations, OBSERVATION: states}),)

@@ -9,13 +9,12 @@ PREFERRED = (4, 0, 2, 6, 8, 1, 3, 5, 7)
 
 def act(observation: NDArray, action_mask: NDArray, rng: np.random.Generator) -> int:
     """Choose a square. observation: own and opponent's marks, (3, 3, 2)."""
-    own, other = observation.reshape(9, 2).T
-    for marks in (own, other):
+    for marks in observation.reshape(9, 2).T:
         completing = [
             square
             for line in LINES
             for square in line
-            if action_mask[square] and sum(marks[each] for each in line) == 2 and not marks[square]
+            if action_mask[square] and marks[list(line)].sum() == 2 and not marks[square]
         ]
         if completing:
             return int(rng.choice(completing))

@@ -69,11 +69,11 @@ class Crossing(MultiAgentEnv):
     def step(self, actions: dict[str, int]) -> tuple[dict[str, Any], ...]:
         """Take a step of all agents that are present."""
         drives = tuple(tuple(actions.get(f"car_{road}_{i}", 0) for i in range(self.cars)) for road in range(ROADS))
-        chosen = tuple(actions[light] for light in self.lights)
+        next_colours = tuple(actions[light] for light in self.lights)
         before = self.distances
         self.distances, rewards = move(before, self.colours, drives)
         light_reward = lights_reward(before, self.colours)
-        self.colours, self.time = chosen, self.time + 1
+        self.colours, self.time = next_colours, self.time + 1
         paid = {agent: rewards[road][i] for agent, (road, i) in self.place.items() if agent in self.agents}
         paid |= dict.fromkeys(self.lights, light_reward)
         passed = {agent: self._distance(agent) == 0 for agent in self.place if agent in self.agents}
@@ -118,9 +118,11 @@ class Crossing(MultiAgentEnv):
             distances = [distance for r in order for distance in self.distances[r]]
             return np.array([*distances, *(self.colours[r] for r in order), road], np.int64)
         road, i = self.place[agent]
-        own, other = self.distances[road], self.distances[1 - road]
-        ahead = own[i - 1] if i else 0
-        return np.array([own[i], self.colours[road], self.colours[1 - road], ahead, road, i, *other], np.float32)
+        cars, crossing_cars = self.distances[road], self.distances[1 - road]
+        ahead = cars[i - 1] if i else 0
+        return np.array(
+            [cars[i], self.colours[road], self.colours[1 - road], ahead, road, i, *crossing_cars], np.float32
+        )
 
 
 def crossing(**kwargs: Any) -> Crossing:
@@ -142,22 +144,22 @@ def move(distances: Distances, colours: Colours, drives: Distances) -> tuple[Dis
     ]
     after, rewards = [], []
     for road in range(ROADS):
-        now: list[int] = []
+        moved: list[int] = []
         paid: list[float] = []
         for i, (distance, drive) in enumerate(zip(distances[road], drives[road], strict=True)):
             if distance == 0:
-                now.append(0)
+                moved.append(0)
                 paid.append(0.0)
                 continue
             reward = -1.0
             target = distance - 1 if drive else distance
-            if i and target and now[i - 1] == target:
+            if i and target and moved[i - 1] == target:
                 target = distance  # the car ahead is there
             if target == 0:
                 reward += (AT_RED if colours[road] == RED else 0.0) + (CRASH if all(passing) else 0.0)
-            now.append(target)
+            moved.append(target)
             paid.append(reward)
-        after.append(tuple(now))
+        after.append(tuple(moved))
         rewards.append(tuple(paid))
     return tuple(after), tuple(rewards)
 
@@ -185,7 +187,7 @@ def optimum(cars: int = 2, length: int = 4, steps: int = 20) -> float:
             drives = tuple(flat[road * cars : (road + 1) * cars] for road in range(ROADS))
             after, rewards = move(distances, colours, drives)
             paid = to_lights + sum(map(sum, rewards))
-            following = max(value(after, chosen, time + 1) for chosen in product((RED, GREEN), repeat=ROADS))
+            following = max(value(after, lights, time + 1) for lights in product((RED, GREEN), repeat=ROADS))
             best = max(best, paid + following)
         return best
 
