@@ -32,10 +32,10 @@ WORKDIR /league
 USER 1000:1000
 
 FROM wheel AS server-packages
+RUN python scripts/without_trainer.py pyproject.toml && python -m build --wheel --outdir /server
 RUN python -m venv /opt/league \
-    && /opt/league/bin/pip install --no-cache-dir --constraint constraints.txt \
-        --requirement deploy/server-requirements.txt \
-    && /opt/league/bin/pip install --no-cache-dir --no-deps /dist/*.whl
+    && wheel=$(echo /server/*.whl) \
+    && /opt/league/bin/pip install --no-cache-dir --constraint constraints.txt "${wheel}[object-store,postgres]"
 
 FROM runtime AS server
 COPY --from=server-packages /opt/league /opt/league
