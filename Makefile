@@ -5,7 +5,7 @@ INSTALLED := .venv/.installed
 
 PROCESSES ?= 3
 
-.PHONY: setup demo test test-slow coverage check fix bench docs generate protocol clean
+.PHONY: setup demo test test-slow coverage check fix bench dist docs generate protocol clean
 .DEFAULT_GOAL := setup
 
 # LOCKED=1 installs the files of requirements/ and no others: Linux on x86-64 only.
@@ -68,6 +68,12 @@ fix: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks $(or $(BENCH),all)
+
+# The distributions of both projects, with the pinned setuptools.
+dist: setup
+	rm -rf dist
+	$(BIN)/python -m build --no-isolation --outdir dist .
+	$(BIN)/python -m build --no-isolation --outdir dist clients/python
 
 # The documentation as a site, in build/site. Fails on a broken link.
 docs: setup

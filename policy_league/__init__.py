@@ -1,1 +1,1 @@
-"""What the `league` command consists of beside its libraries: subcommands, bundled configurations and example games."""
+"""The `league` command, the bundled configurations and the example environments."""
