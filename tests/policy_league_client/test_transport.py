@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import pytest
 
-from league.client import Client, retries
 from league.errors import BodyTooLarge, InvalidInput, NotReady, ObservationError, RemoteError, UnknownLeague
+from policy_league_client import Client, retries
 
 DROP = (0, b"")
 """A prepared response that closes the connection."""
