@@ -38,7 +38,9 @@ RULES = [
 DASHBOARD = json.loads((ROOT / "deploy/grafana/policy-league.json").read_text())
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 IMAGES = tuple(f"{name}:{__version__}" for name in ("policy-league", "policy-league-trainer"))
-OPERATIONS = (ROOT / "docs/operations.md").read_text()
+OPERATIONS, MONITORING, SETTINGS = (
+    (ROOT / f"docs/{page}.md").read_text() for page in ("operations", "monitoring", "server-settings")
+)
 
 
 def exports() -> dict[str, str]:
@@ -281,17 +283,17 @@ def test_panels_do_not_overlap() -> None:
 
 
 def test_each_alert_is_documented() -> None:
-    documented = re.findall(r"^\| `(League\w+)` \|", OPERATIONS, flags=re.M)
+    documented = re.findall(r"^\| `(League\w+)` \|", MONITORING, flags=re.M)
     assert documented == [rule["alert"] for rule in RULES]
     assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in RULES)
 
 
 def test_each_metric_is_documented() -> None:
-    assert set(re.findall(r"^\| `(league_\w+)` \|", OPERATIONS, flags=re.M)) == METRICS.keys()
+    assert set(re.findall(r"^\| `(league_\w+)` \|", MONITORING, flags=re.M)) == METRICS.keys()
 
 
 def test_each_serving_setting_is_documented_with_its_default() -> None:
-    rows = dict(re.findall(r"^\| `(\w+)` \| `(.*?)` \|", OPERATIONS, flags=re.M))
+    rows = dict(re.findall(r"^\| `(\w+)` \| `(.*?)` \|", SETTINGS, flags=re.M))
     defaults = {name: field.default for name, field in ServeSettings.model_fields.items()}
     assert {name: yaml.safe_load(value) for name, value in rows.items()} == defaults
 

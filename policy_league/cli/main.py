@@ -59,7 +59,7 @@ PANELS = {
             "evaluation.nightly:nightly", "Test new versions, promote those that pass, and update the ratings."
         ),
         "report": Subcommand(
-            "evaluation.report:report", "Write a league's leaderboard, verdicts and upsets as one page."
+            "evaluation.report:report", "Write the results of a league as one HTML file."
         ),
         "replay": Subcommand("evaluation.replay:replay", "Record a game as an animated image, or show it in a window."),
         "verify": Subcommand(

@@ -8,7 +8,7 @@ from pydantic import AliasPath, Field
 
 from league.errors import UnknownRun
 from league.registry.registry import Registry
-from league.registry.storage.rows import RunRow, RunState, StrengthRow
+from league.registry.storage.rows import RunRow, RunState
 from serve_app.declaration import Declaration, Page, Response
 
 Curves = Annotated[
@@ -52,13 +52,26 @@ class Point(Response):
     curves: Curves
 
 
+class Strength(Response):
+    """The score of a version in the matches that its training run played against an opponent."""
+
+    version: int
+    steps: int = Field(description="Actions of the run before the version, with those of its parent versions.")
+    opponent: str = Field(description="A fixed reference.")
+    games: int
+    score: float
+    low: float = Field(description="Lower bound of the 95 % interval.")
+    high: float = Field(description="Upper bound of the 95 % interval.")
+    at: datetime
+
+
 class Run(ListedRun):
     """A training run with its settings, its curves and the strength of its versions."""
 
     league: str
     settings: dict[str, Any] = Field(description="The settings of the algorithm.")
     points: list[Point] = Field(description="Ordered by steps, at most a few hundred.")
-    strength: list[StrengthRow] = Field(
+    strength: list[Strength] = Field(
         description="The scores of its versions against the opponents of `training.strength`, oldest version first."
     )
 
