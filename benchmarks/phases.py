@@ -84,7 +84,8 @@ def learning(algorithm: OffPolicy, part: Phase, seconds: float) -> tuple[float, 
 
 def main(parts: Parts = None, quick: Quick = False) -> Iterator[Target]:
     """Measure the configurations."""
+    configurations = chosen(parts, PARTS)
     one_thread()
     with local_ray(cpus=1):
-        for name, part in chosen(parts, PARTS).items():
+        for name, part in configurations.items():
             yield from measure(name, part, *(5.0, 3) if quick else (40.0, 7))

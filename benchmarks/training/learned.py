@@ -74,6 +74,7 @@ def local_ray(cpus: int) -> Iterator[None]:
         yield
     finally:
         ray.shutdown()
+        logging.disable(logging.NOTSET)
 
 
 def learn(
