@@ -58,9 +58,7 @@ PANELS = {
         "nightly": Subcommand(
             "evaluation.nightly:nightly", "Test new versions, promote those that pass, and update the ratings."
         ),
-        "report": Subcommand(
-            "evaluation.report:report", "Write the results of a league as one HTML file."
-        ),
+        "report": Subcommand("evaluation.report:report", "Write the results of a league as one HTML file."),
         "replay": Subcommand("evaluation.replay:replay", "Record a game as an animated image, or show it in a window."),
         "verify": Subcommand(
             "evaluation.verdicts:verify", "Recompute a verdict from the ledger and compare the results."
