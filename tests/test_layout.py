@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PRODUCT = ("league", "training", "serve_app", "evaluation", "policy_league", "clients/python/policy_league_client")
 GENERATED = ("migrations/", "_pb2.py", "_sync/")
-MAX_LINES, MAX_DEPENDENCIES = 3_000, 16
+MAX_LINES, MAX_DEPENDENCIES = 3_000, 17
 """Budget of a package, without its sub-packages: lines, and other packages of the product that it imports."""
 ONE_PER_RESOURCE = {"serve_app/routes": 4_000}
 """Lines of packages with a module per resource of the HTTP API, which describes it, too."""
