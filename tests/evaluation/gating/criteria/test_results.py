@@ -32,7 +32,17 @@ WON, LOST, EVEN = (1.0, 1.0), (0.0, 0.0), (1.0, 0.0)
 
 def verdict(gate: GateConfig = GATE) -> VerdictRow:
     settings = {"gate": gate.model_dump(mode="json")}
-    return VerdictRow("l-verdict-1", "l", 3, CHAMPION, settings, None, None, datetime.now(UTC), None)
+    return VerdictRow(
+        id="l-verdict-1",
+        league="l",
+        candidate=3,
+        champion=CHAMPION,
+        settings=settings,
+        outcome=None,
+        evidence=None,
+        opened_at=datetime.now(UTC),
+        closed_at=None,
+    )
 
 
 def match(contestant: str, opponent: str, scores: Sequence[float]) -> Match:
