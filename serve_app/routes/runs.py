@@ -97,4 +97,6 @@ def run(registry: Registry, league: str, run: str) -> dict[str, Any]:
     """Get a training run with its metrics."""
     row, points = registry.runs.get(league, run), registry.runs.points(league, run)
     details = {"points": points, "strength": registry.strength.of_run(league, run)}
-    return ListedRun.model_validate(row).model_dump() | {"league": league, "settings": row.settings} | details
+    # The time budget is read from the settings again: given by both names, it would be refused.
+    listed = ListedRun.model_validate(row).model_dump(exclude={"minutes"})
+    return listed | {"league": league, "settings": row.settings} | details

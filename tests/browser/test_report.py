@@ -171,31 +171,19 @@ def test_a_game_that_cannot_be_replayed_has_a_reason(opened: Open, report: dict[
     expect(page.get_by_role("alert")).to_contain_text("The environment is broken.")
 
 
-@pytest.mark.parametrize(
-    ("model", "outcome", "exploiters", "expected"),
-    [
-        ("normalized", "more exploitable", 2, "more exploitable than tictactoe@2 by 0.1 of all points"),
-        ("returns", "more exploitable", 1, "more exploitable than tictactoe@2 by 0.1 in returns"),
-        ("normalized", "less exploitable", 2, "less exploitable than tictactoe@2"),
-        ("normalized", "inconclusive", 1, "inconclusive compared with tictactoe@2"),
-    ],
-)
-def test_further_evidence_of_a_verdict(
-    opened: Open, report: dict[str, Any], model: str, outcome: str, exploiters: int, expected: str
-) -> None:
+@pytest.mark.parametrize("exploiters", [2, 1])
+def test_further_evidence_of_a_verdict(opened: Open, report: dict[str, Any], exploiters: int) -> None:
     contents = deepcopy(report)
     newest = contents["documents"][f"{BASE}/verdicts"]["verdicts"][0]["verdict"]
-    test = exploitability_report(outcome, exploiters, improvement=0.05 if outcome == "less exploitable" else 0.0)
+    test = exploitability_report(exploiters)
     confirmation = {"verdict": newest, "candidate": "a@2", "opponent": "a@1", "games": 400, "score": 0.544, "elo": 31.0}
     confirmation |= {"interval": [None, 59.0], "difference": Difference(1.5, 0.5, 2.5).to_json()}
-    more = {"model": model, "exploitability": test.to_json(), "confirmation": confirmation, "alpha": 0.05 / 365}
+    more = {"exploitability": test.to_json(), "confirmation": confirmation, "alpha": 0.05 / 365}
     contents["documents"][f"{BASE}/verdicts/{newest}"] |= more
     page = select(opened(contents), "Verdicts")
     page.locator("tbody th a").first.click()
     main = page.locator("main")
-    expect(main).to_contain_text(
-        re.compile(rf"tictactoe@3: {re.escape(expected)} after 600 games, LLR.* −3\.00\.", re.S)
-    )
+    expect(main).to_contain_text(re.compile(rf"{re.escape(test.finding)}.*LLR.* −3\.00", re.S))
     expect(main).to_contain_text("A best response to tictactoe@2 scores at least 40.0 %.")
     others = "; for others that are trained in the same way: +0.100 (+0.010 to +0.190)"
     expect(main).to_contain_text(f"The 95 % interval is for these exploiters{others if exploiters > 1 else ''}.")

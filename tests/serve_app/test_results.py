@@ -218,7 +218,12 @@ def test_runs_are_listed_newest_first(reader: TestClient) -> None:
 def test_a_run_has_its_curves(reader: TestClient) -> None:
     run = get(reader, f"{BOARD}/runs/first", "Run")
     assert [(point["steps"], point["curves"]["return"]) for point in run["points"]] == [(100, 0.1), (200, 0.2)]
-    assert (run["settings"], run["seconds"], run["target"], run["minutes"]) == ({"lr": 0.001}, 20.0, 1000, None)
+    assert (run["settings"], run["seconds"], run["target"], run["minutes"]) == (
+        {"lr": 0.001, "minutes": 10},
+        20.0,
+        1000,
+        10.0,
+    )
 
 
 def test_a_run_has_the_strength_of_its_versions(reader: TestClient) -> None:

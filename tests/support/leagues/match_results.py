@@ -108,7 +108,7 @@ def evidence(won: bool) -> dict[str, Any]:
 
 def _runs(registry: Registry) -> None:
     for run in ("first", "second"):
-        registry.runs.begin(LEAGUE, run, algorithm="ppo", settings={"lr": 0.001}, seed=3, target=1000)
+        registry.runs.begin(LEAGUE, run, algorithm="ppo", settings={"lr": 0.001, "minutes": 10}, seed=3, target=1000)
     for steps in (100, 200):
         point = RunPoint(LEAGUE, "first", steps, {"return": steps / 1000, "shared/entropy": 1.5}, datetime.now(UTC))
         registry.runs.record(LEAGUE, "first", point, seconds=steps / 10)
