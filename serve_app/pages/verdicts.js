@@ -122,7 +122,8 @@ function Exploitability({ test }) {
   const name = "Learned exploitability";
   return html`<h3>${name}</h3>
     <p>The exploiters of the candidate achieve ${spread(test.difference)} more than those of the champion.
-      The 95 % interval is for these exploiters${others.low == null ? "" : html`; for others that are trained in the same way: ${spread(others)}`}.</p>
+      The 95 % interval is for these exploiters${others.low == null ? "" : html`; for others that are trained in the same way: ${spread(others)}`}.
+      ${[test.candidate, test.champion].map((version) => html` A best response to <span class="ref">${version.ref}</span> scores at least ${percent(version.bound)}.`)}</p>
     <${Table} caption=${name} head=${[["Version"], ["Exploiter"], ["Games", "number"], ["Score", "number"], ["95 % interval"], ["Return gain", "number"]]}>
       ${rows.map(([version, exploiter]) => html`<tr key=${exploiter.ref}><th scope="row"><span class="ref">${version.ref}</span></th><td><span class="ref">${exploiter.ref}</span></td>
         <td class="number">${count(exploiter.games)}</td><td class="number">${percent(exploiter.score)}</td><td class="nowrap">${percent(exploiter.low)} to ${percent(exploiter.high)}</td>
