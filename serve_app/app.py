@@ -42,14 +42,14 @@ from serve_app.inference_protocol.grpc_service import InferenceService
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.rest import InferRoute, RestRoutes
 from serve_app.inference_protocol.statistics import REPORT
-from serve_app.models.action_selections import ActionSelections
-from serve_app.models.alias_slots import AliasSlots
-from serve_app.models.registry_connection import RegistryConnection
-from serve_app.models.registry_watcher import RegistryWatcher
-from serve_app.models.resolver import ModelResolver
-from serve_app.models.shadow import Shadow
-from serve_app.models.traffic_split import TrafficSplit
-from serve_app.models.version_cache import VersionCache, load
+from serve_app.live_versions.action_selections import ActionSelections
+from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.registry_connection import RegistryConnection
+from serve_app.live_versions.registry_watcher import RegistryWatcher
+from serve_app.live_versions.resolver import ModelResolver
+from serve_app.live_versions.shadow import Shadow
+from serve_app.live_versions.traffic_split import TrafficSplit
+from serve_app.live_versions.version_cache import VersionCache, load
 from serve_app.observability.load import LoadSampler
 from serve_app.observability.metrics import Metrics, Report
 from serve_app.observability.metrics_reporter import MetricsReporter

@@ -18,8 +18,8 @@ from serve_app.codecs.observation_codec import json_type, read_state, reject_str
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
 from serve_app.codecs.state_tokens import read_state as state_of_tokens
-from serve_app.models.resolver import version_of
-from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.resolver import version_of
+from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 
 KEYS = frozenset(("observation", "observations", "state", "explore", "seed", "probabilities"))
 OBSERVATIONS = ("observation", "observations")

@@ -20,7 +20,7 @@ from league.errors import BodyTooLarge, InvalidInput, ObservationError
 from league.policies.onnx import ACTION
 from league.spaces import ACTION_MASK, Leaf
 from league.spaces.arrays import check, check_mask
-from serve_app.models.version_cache import LoadedPolicy
+from serve_app.live_versions.version_cache import LoadedPolicy
 
 FRAMING = 1
 REQUEST = struct.Struct("<BBHIQ")

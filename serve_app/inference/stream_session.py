@@ -41,11 +41,11 @@ from serve_app.inference.action_request import (
     reject_unknown_keys,
 )
 from serve_app.inference.stream_codec import BinaryCodec, parse_request
-from serve_app.models.alias_slots import AliasSlots
-from serve_app.models.resolver import ModelResolver, policy_ref
-from serve_app.models.shadow import Shadow
-from serve_app.models.traffic_split import Headers, TrafficSplit, acting
-from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.resolver import ModelResolver, policy_ref
+from serve_app.live_versions.shadow import Shadow
+from serve_app.live_versions.traffic_split import Headers, TrafficSplit, acting
+from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.observability.metrics import Metrics
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import CloseStream, StreamMessage

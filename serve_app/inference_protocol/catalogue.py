@@ -12,8 +12,8 @@ from league.registry.registry import Registry
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.statistics import REPORT, Document, ModelStatistics, sum_documents
 from serve_app.inference_protocol.tensors import TensorSpec
-from serve_app.models.resolver import ModelResolver
-from serve_app.models.version_cache import VersionCache
+from serve_app.live_versions.resolver import ModelResolver
+from serve_app.live_versions.version_cache import VersionCache
 from serve_app.settings import ServeSettings
 
 PACKAGE = "policy-league"

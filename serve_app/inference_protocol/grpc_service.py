@@ -22,8 +22,8 @@ from serve_app.inference_protocol.inference import Inference, InferRequest, Infe
 from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
 from serve_app.inference_protocol.statistics import Document
 from serve_app.inference_protocol.tensors import Data, RequestTensor, Signature, datatype_of, to_bytes
-from serve_app.models.registry_watcher import RegistryWatcher
-from serve_app.models.traffic_split import Headers
+from serve_app.live_versions.registry_watcher import RegistryWatcher
+from serve_app.live_versions.traffic_split import Headers
 from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
 from serve_app.settings import ServeSettings
 

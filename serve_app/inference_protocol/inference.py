@@ -17,10 +17,10 @@ from league.refs import CHAMPION
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference_protocol.statistics import Statistics
 from serve_app.inference_protocol.tensors import RequestTensor, Signature, read_inputs, signature_of
-from serve_app.models.resolver import ModelResolver, policy_ref
-from serve_app.models.shadow import MirrorFunction, Shadow
-from serve_app.models.traffic_split import Headers
-from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.resolver import ModelResolver, policy_ref
+from serve_app.live_versions.shadow import MirrorFunction, Shadow
+from serve_app.live_versions.traffic_split import Headers
+from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.observability.metrics import Metrics
 from serve_app.settings import ServeSettings
 

@@ -22,7 +22,7 @@ from serve_app.inference.action_request import REPLICA
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferResponse
 from serve_app.inference_protocol.rest_codec import compressed, read_request, write_response
-from serve_app.models.registry_watcher import RegistryWatcher
+from serve_app.live_versions.registry_watcher import RegistryWatcher
 from serve_app.settings import ServeSettings
 
 JSON, BINARY = b"application/json", b"application/octet-stream"

@@ -12,11 +12,11 @@ from typing import Any
 
 from league.histograms import Histogram
 from serve_app.access.permissions import league_of
-from serve_app.models.alias_slots import AliasSlots
-from serve_app.models.resolver import policy_ref
-from serve_app.models.shadow import Shadow
-from serve_app.models.traffic_split import TrafficSplit
-from serve_app.models.version_cache import LoadedVersion
+from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.resolver import policy_ref
+from serve_app.live_versions.shadow import Shadow
+from serve_app.live_versions.traffic_split import TrafficSplit
+from serve_app.live_versions.version_cache import LoadedVersion
 
 MAX_SERIES = 1024
 """Maximum policies and versions with counts; the least recently used are dropped."""

@@ -9,9 +9,9 @@ from time import monotonic
 
 from league.errors import LeagueError
 from league.registry.storage.rows import ShadowCounts
-from serve_app.models.polling import Polling
-from serve_app.models.registry_connection import SHUTDOWN_TIMEOUT, RegistryConnection
-from serve_app.models.shadow import Shadow
+from serve_app.live_versions.polling import Polling
+from serve_app.live_versions.registry_connection import SHUTDOWN_TIMEOUT, RegistryConnection
+from serve_app.live_versions.shadow import Shadow
 from serve_app.observability.disk_space import DiskSpace
 from serve_app.observability.metrics import Metrics, Report, Samples
 from serve_app.settings import ServeSettings

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.openapi.examples import action_request, infer_request
 from serve_app.openapi.operations import KEY, Document, describe
 from serve_app.routes.table import ROUTES

@@ -13,7 +13,7 @@ from league.policies.actions import bounds
 from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space, inputs
 from league.spaces.arrays import nested
 from serve_app.inference_protocol.tensors import datatype_of
-from serve_app.models.version_cache import LoadedPolicy
+from serve_app.live_versions.version_cache import LoadedPolicy
 
 MAX_LISTED = 512
 """Maximum numbers listed in an example; larger leaves are base64."""

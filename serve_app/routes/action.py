@@ -39,9 +39,9 @@ from serve_app.inference.action_request import (
     read_observations,
     reject_unknown_keys,
 )
-from serve_app.models.resolver import ModelResolver
-from serve_app.models.shadow import MirrorFunction, Shadow
-from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.resolver import ModelResolver
+from serve_app.live_versions.shadow import MirrorFunction, Shadow
+from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.observability.metrics import Metrics
 from serve_app.routes.query_string import query_params
 from serve_app.settings import ServeSettings

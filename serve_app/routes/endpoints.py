@@ -26,7 +26,7 @@ from league.registry.storage.idempotency import IdempotentCall
 from serve_app.access.access_control import DEADLINE, KEY
 from serve_app.access.request_body import MAX_CHANGE_BODY, read_body
 from serve_app.declaration import IDEMPOTENCY_KEY, IN_PATH, MAX_KEY_LENGTH, Declaration, Page, Parameter, declared
-from serve_app.models.resolver import ModelResolver
+from serve_app.live_versions.resolver import ModelResolver
 
 Body = TypeVar("Body", bound=BaseModel)
 Values = dict[str, Any]

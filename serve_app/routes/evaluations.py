@@ -29,7 +29,7 @@ from serve_app.access.access_control import DEADLINE
 from serve_app.access.api_keys import ApiKey
 from serve_app.declaration import Declaration, Page, Parameter
 from serve_app.evaluation_client import EvaluationClient, require_client
-from serve_app.models.resolver import ModelResolver
+from serve_app.live_versions.resolver import ModelResolver
 from serve_app.routes.documents import Evaluation, EvaluationSummary
 from serve_app.settings import ServeSettings
 

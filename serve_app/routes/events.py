@@ -24,8 +24,8 @@ from serve_app.access.access_control import KEY, AccessControl
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.declaration import EVENT_STREAM, Declaration, Response
-from serve_app.models.polling import Polling
-from serve_app.models.resolver import ModelResolver
+from serve_app.live_versions.polling import Polling
+from serve_app.live_versions.resolver import ModelResolver
 from serve_app.routes.documents import Aliases, Evaluation, EvaluationProgress
 from serve_app.runtime.ray_serve import logger
 from serve_app.settings import ServeSettings

@@ -40,7 +40,7 @@ from league.service_requests import (
 )
 from serve_app.declaration import Declaration, Parameter, integer
 from serve_app.evaluation_client import EvaluationClient, require_client
-from serve_app.models.resolver import ModelResolver
+from serve_app.live_versions.resolver import ModelResolver
 
 GAME_PATH = "/v1/leagues/{league}/matches/{schedule}/{position}/games/{game}"
 OF_GAMES = (NoEvaluationService, GameCrashed, WorkerLost, GameHung)

@@ -11,8 +11,8 @@ from league.errors import NotReady, Unauthenticated
 from league.registry.registry import Registry
 from serve_app.access.access_control import AccessControl
 from serve_app.declaration import Declaration, Response, Scope
-from serve_app.models.registry_watcher import RegistryWatcher
-from serve_app.models.resolver import ModelResolver
+from serve_app.live_versions.registry_watcher import RegistryWatcher
+from serve_app.live_versions.resolver import ModelResolver
 from serve_app.observability.metrics import Report
 from serve_app.observability.prometheus import render
 

@@ -27,8 +27,8 @@ from serve_app.access.connection_limit import ConnectionLimit, within_descriptor
 from serve_app.declaration import ALIAS, CALLER, REPLICA_HEADER, VERSION, Declaration, Parameter
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
-from serve_app.models.resolver import policy_ref, version_of
-from serve_app.models.version_cache import LoadedVersion
+from serve_app.live_versions.resolver import policy_ref, version_of
+from serve_app.live_versions.version_cache import LoadedVersion
 from serve_app.routes.query_string import query_params
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import (

@@ -15,8 +15,8 @@ from league.registry.storage.rows import Portion, ShadowCounts
 from league.registry.traffic import KEEP, Unchanged
 from serve_app.access.api_keys import ApiKey
 from serve_app.declaration import NUMBER_OR_ALIAS, Declaration, Response
-from serve_app.models.resolver import ModelResolver
-from serve_app.models.shadow import Shadow
+from serve_app.live_versions.resolver import ModelResolver
+from serve_app.live_versions.shadow import Shadow
 from serve_app.observability.metrics import Metrics, Report
 from serve_app.routes.documents import ChangeBody, Number, TrafficSetting
 

@@ -28,7 +28,7 @@ from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from policy_league_client import AsyncClient, Client
-from serve_app.models.traffic_split import key_position
+from serve_app.live_versions.traffic_split import key_position
 from tests.support.clients.sync_and_async import Connect
 from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.streaming import Listening, listening

@@ -5,8 +5,8 @@ import pytest
 
 from league.errors import ArtifactCorrupt
 from league.registry.registry import Registry
-from serve_app.models import version_cache
-from serve_app.models.action_selections import ActionSelections
+from serve_app.live_versions import version_cache
+from serve_app.live_versions.action_selections import ActionSelections
 from tests.support.clients.actions import BOARD, act, boards
 from tests.support.leagues.served_leagues import publish
 from tests.support.policies.graphs import endless_mlp

@@ -13,7 +13,7 @@ from starlette.testclient import TestClient
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
-from serve_app.models.traffic_split import key_position
+from serve_app.live_versions.traffic_split import key_position
 from tests.support.clients.actions import BOARD
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import replica

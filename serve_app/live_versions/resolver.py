@@ -10,9 +10,9 @@ from league.errors import NotReady, UnknownAlias, VersionRetired
 from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_version
 from league.registry.registry import Registry
 from league.registry.storage.database import before
-from serve_app.models.alias_slots import AliasSlots
-from serve_app.models.traffic_split import Headers, TrafficSplit, acting
-from serve_app.models.version_cache import LoadedPolicy, LoadedVersion, VersionCache
+from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.traffic_split import Headers, TrafficSplit, acting
+from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion, VersionCache
 
 T = TypeVar("T")
 

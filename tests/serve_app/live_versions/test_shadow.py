@@ -14,7 +14,7 @@ from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from serve_app.app import Replica
-from serve_app.models.shadow import MAX_ROWS, MirroredRequest, Shadow, compare
+from serve_app.live_versions.shadow import MAX_ROWS, MirroredRequest, Shadow, compare
 from tests.support.clients.actions import BOARD, act, boards
 from tests.support.leagues.served_leagues import promote, publish
 from tests.support.policies.graphs import endless_mlp, masked_mlp
@@ -122,7 +122,7 @@ def test_a_run_that_does_not_end_is_counted(client: TestClient, registry: Regist
 def test_runs_end_when_the_shadow_is_switched_off(
     client: TestClient, server: Replica, registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("serve_app.models.version_cache.SHADOW_TIMEOUT", 600.0)
+    monkeypatch.setattr("serve_app.live_versions.version_cache.SHADOW_TIMEOUT", 600.0)
     endless = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
     set_shadow(registry, version=endless)
     act(client, observation=FULL)
@@ -172,7 +172,7 @@ async def test_observations_beyond_the_size_limit_of_the_queue_are_dropped(
     assert mirror is not None
     observations = {name: np.array([value], np.int8) for name, value in BOARD.items()}
     size = sum(array.nbytes for array in observations.values())
-    monkeypatch.setattr("serve_app.models.shadow.MAX_WAITING_BYTES", 2 * size)
+    monkeypatch.setattr("serve_app.live_versions.shadow.MAX_WAITING_BYTES", 2 * size)
     for _ in range(3):
         mirror(observations, None, np.array([0]))
     assert [one.dropped for one in shadow.shadowings()] == [1]

@@ -28,10 +28,10 @@ from league.policies.policy import Arrays
 from league.policies.probes import same
 from league.random.seeds import generators
 from league.registry.storage.rows import ShadowCounts
-from serve_app.models.alias_slots import AliasSlots
-from serve_app.models.resolver import policy_ref
-from serve_app.models.traffic_split import TrafficSplit, acting
-from serve_app.models.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.resolver import policy_ref
+from serve_app.live_versions.traffic_split import TrafficSplit, acting
+from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.runtime.ray_serve import logger
 from serve_app.settings import ServeSettings
 

@@ -10,7 +10,7 @@ import pytest
 from league.errors import ArtifactCorrupt, Overloaded, StorageError
 from league.registry.storage.mixture import Member, Mixture
 from league.registry.storage.rows import VersionState
-from serve_app.models.version_cache import MAX_REQUESTED, LoadedVersion, VersionCache
+from serve_app.live_versions.version_cache import MAX_REQUESTED, LoadedVersion, VersionCache
 
 pytestmark = pytest.mark.anyio
 

@@ -1,0 +1,1 @@
+"""The versions that a replica answers with: registry watcher, version cache, hot swap, canary and shadow."""

@@ -1,1 +1,0 @@
-"""Served versions: registry watcher, version cache, hot swap, canary and shadow."""
