@@ -25,7 +25,7 @@ from benchmarks.training.learned import local_ray, one_thread, two_at_once
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.maddpg import MADDPG
-from training.algorithms.setup import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.runs.trial import build_algorithm
 from training.sampling.replay_runner import ActorRunner
 

@@ -16,13 +16,13 @@ from league.interface import Interface
 from league.settings import Storage
 from league.spaces import Discrete
 from training.algorithms.off_policy import off_policy_config
-from training.algorithms.setup import encoder_settings, rl_module_specs
+from training.algorithms.rllib_config import encoder_settings, rl_module_specs
 from training.learners.dqn import DQNLearner
 from training.modules.q_network import QNetwork
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
-    """See `training.algorithms.setup.algorithm_config`."""
+    """See `training.algorithms.rllib_config.algorithm_config`."""
     assert isinstance(league.training, DQNConfig)
     modules = module_spec(league.training, interface)
     return off_policy_config(league, interface, storage, modules=modules, learner=DQNLearner)

@@ -17,7 +17,7 @@ from league.errors import ConfigError
 from league.interface import Interface
 from league.settings import Storage
 from training.algorithms.off_policy import OffPolicy, off_policy_config
-from training.algorithms.setup import encoder_settings, rl_module_specs
+from training.algorithms.rllib_config import encoder_settings, rl_module_specs
 from training.learners.maddpg import MADDPGLearner
 from training.modules.maddpg import Actor
 from training.sampling.closed_transitions import JOINT
@@ -45,7 +45,7 @@ class MADDPG(OffPolicy):
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
-    """See `training.algorithms.setup.algorithm_config`."""
+    """See `training.algorithms.rllib_config.algorithm_config`."""
     settings = league.training
     assert isinstance(settings, MADDPGConfig)
     if settings.opponents.any:

@@ -41,10 +41,10 @@ from league.config.training import TrainingSettings
 from league.interface import Interface
 from league.random.seeds import derive
 from league.settings import Storage
-from training.algorithms import setup
+from training.algorithms import rllib_config
 from training.algorithms.league_algorithm import LeagueAlgorithm
 from training.algorithms.metrics import EXPLORATION
-from training.algorithms.setup import configure
+from training.algorithms.rllib_config import configure
 from training.learners.off_policy import OffPolicyLearner
 from training.replay_buffer import ReplayBuffer, Sample, saved_capacity
 from training.rllib_compat import ExplicitConfig, local_learner
@@ -81,7 +81,7 @@ class OffPolicy(LeagueAlgorithm):
     def training_step(self) -> None:
         """Sample and learn in rounds until ITERATION_STEPS actions were taken, and log metrics."""
         seconds = dict.fromkeys((ENV_RUNNER_SAMPLING_TIMER, LEARNER_UPDATE_TIMER, SYNCH_WORKER_WEIGHTS_TIMER), 0.0)
-        learning = setup.learning_policies(self.settings, tuple(self.config.policies), self.iteration)
+        learning = rllib_config.learning_policies(self.settings, tuple(self.config.policies), self.iteration)
         before = self.steps
         target = before + ITERATION_STEPS
         while self.steps < target:

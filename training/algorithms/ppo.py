@@ -31,9 +31,9 @@ from league.errors import ConfigError
 from league.interface import Interface
 from league.settings import Storage
 from league.spaces import ACTION_MASK, inputs
-from training.algorithms import setup
+from training.algorithms import rllib_config
 from training.algorithms.league_algorithm import LeagueAlgorithm
-from training.algorithms.setup import configure, encoder_settings, rl_module_specs
+from training.algorithms.rllib_config import configure, encoder_settings, rl_module_specs
 from training.learners.magnet import check_magnet
 from training.learners.ppo import PPOLearner, hyperparameters
 from training.learners.teacher import check_teacher
@@ -54,7 +54,7 @@ class PPO(LeagueAlgorithm, ppo.PPO):
         with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
             learned = self.learner_group.update(
                 episodes=chunks,
-                policies=setup.learning_policies(settings, tuple(self.config.policies), self.iteration),
+                policies=rllib_config.learning_policies(settings, tuple(self.config.policies), self.iteration),
                 progress=self.progress,
                 num_epochs=self.config.num_epochs,
                 minibatch_size=self.config.minibatch_size,
@@ -92,7 +92,7 @@ def _sample_chunks(
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> ppo.PPOConfig:
-    """See `training.algorithms.setup.algorithm_config`."""
+    """See `training.algorithms.rllib_config.algorithm_config`."""
     settings = league.training
     assert isinstance(settings, PPOConfig)
     hyperparameters(settings, interface.policy_ids)

@@ -14,14 +14,14 @@ from league.config.off_policy import QMIXConfig
 from league.interface import Interface
 from league.settings import Storage
 from training.algorithms.off_policy import off_policy_config
-from training.algorithms.setup import encoder_settings, rl_module_specs
+from training.algorithms.rllib_config import encoder_settings, rl_module_specs
 from training.learners.qmix import QMIXLearner, teams
 from training.modules.qmix import AgentNetwork
 from training.sampling.replay_runner import JointRunner
 
 
 def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
-    """See `training.algorithms.setup.algorithm_config`."""
+    """See `training.algorithms.rllib_config.algorithm_config`."""
     assert isinstance(league.training, QMIXConfig)
     return off_policy_config(
         league,

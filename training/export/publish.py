@@ -15,7 +15,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, PROBES, TRAINING, Manifest, PolicyManifest
 from league.registry.storage.rows import VersionRow
 from league.stack import installed
-from training.algorithms.setup import module_spec
+from training.algorithms.rllib_config import module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy, graph_tensors
 from training.modules.policy_module import PolicyModule

@@ -22,7 +22,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MAIN, TRAINING, Role
 from league.registry.storage.rows import VersionRow
 from training.algorithms.off_policy import starts_with_empty_replay
-from training.algorithms.setup import algorithm_config, module_spec, num_envs
+from training.algorithms.rllib_config import algorithm_config, module_spec, num_envs
 from training.export.publish import git_commit
 from training.rllib_compat import NotPickled, silence_tune
 from training.runs.driver_files import driver_machine

@@ -34,7 +34,7 @@ from training.algorithms.metrics import (
     totals,
     training_metrics,
 )
-from training.algorithms.setup import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.rllib_compat import wait_for_runners
 from training.runs.checkpoint_digests import write_digests
 from training.runs.driver_files import DriverFiles, DriverMachine

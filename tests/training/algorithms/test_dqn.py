@@ -18,7 +18,7 @@ from league.policies.onnx import OnnxPolicy
 from tests.support.environments.training_environments import ROUNDS
 from tests.support.leagues.training_leagues import solvable, solvable_by_dqn
 from training.algorithms.off_policy import OffPolicy, starts_with_empty_replay
-from training.algorithms.setup import algorithm_config, module_spec
+from training.algorithms.rllib_config import algorithm_config, module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy
 from training.learners import dqn as learning

@@ -14,7 +14,7 @@ from league.errors import ConfigError, EnvironmentMismatch
 from tests.support.environments.training_environments import ROUNDS
 from tests.support.leagues.training_leagues import maddpg
 from training.algorithms.maddpg import MADDPG
-from training.algorithms.setup import algorithm_config, module_spec
+from training.algorithms.rllib_config import algorithm_config, module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy
 from training.runs.trial import build_algorithm

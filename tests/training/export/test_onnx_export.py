@@ -17,7 +17,7 @@ from league.policies.onnx import OnnxPolicy
 from league.spaces import MultiDiscrete
 from league.spaces.conversion import to_gymnasium
 from tests.support.leagues.training_leagues import counting, solvable, solvable_by_dqn, tictactoe
-from training.algorithms import setup
+from training.algorithms import rllib_config
 from training.algorithms.ppo import module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy, graph_tensors
@@ -167,7 +167,7 @@ def test_near_ties_are_accepted_if_the_previous_action_is_an_input(tmp_path: Pat
     league = solvable_by_dqn("masked", **MEMORY)
     interface_of_league = interface(league)
     spaces = interface_of_league.of_policy("shared")
-    first, second = (setup.module_spec(league.training, interface_of_league).build()["shared"] for _ in range(2))
+    first, second = (rllib_config.module_spec(league.training, interface_of_league).build()["shared"] for _ in range(2))
     second.set_state(first.get_state())
     for net, better in ((first, 0), (second, 2)):
         with torch.no_grad():

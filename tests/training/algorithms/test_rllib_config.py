@@ -5,7 +5,7 @@ import pytest
 from league.environments.building import interface
 from league.errors import ConfigError
 from tests.support.leagues.training_leagues import counting, tictactoe
-from training.algorithms.setup import check_opponents, check_policies_to_train, learning_policies, num_envs
+from training.algorithms.rllib_config import check_opponents, check_policies_to_train, learning_policies, num_envs
 
 POLICIES = ("a", "b", "c")
 
