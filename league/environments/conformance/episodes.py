@@ -16,7 +16,7 @@ from league.config.league import LeagueConfig
 from league.config.network import channels_of
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
 from league.environments.building import build
-from league.environments.conformance.findings import Episode, Examination, Trace
+from league.environments.conformance.findings import Examination, PlayedEpisode, Trace
 from league.environments.conformance.observations import ObservationCheck, check_constant_observations
 from league.environments.conformance.openings import joined, measure_openings
 from league.environments.conformance.random_actions import RandomActions
@@ -77,7 +77,7 @@ class Examiner:
         """
         examination, adapter, budget = self._found, adapter_for(self._env, self._checks), self._budget
         began = time.perf_counter()
-        first: list[Episode] = []
+        first: list[PlayedEpisode] = []
         while len(first) < episodes and not (first and budget.is_spent(FIRST)):
             first.append(self._first_episode(adapter, seed + len(first), f"episode {len(first) + 1} of {episodes}"))
         examination.lengths = [episode.steps for episode in first]
@@ -98,7 +98,7 @@ class Examiner:
             budget.skipped.append("random openings were not measured")
         _check_openings(self._config.play.opening_plies, examination)
 
-    def _first_episode(self, adapter: EnvAdapter, seed: int, doing: str) -> Episode:
+    def _first_episode(self, adapter: EnvAdapter, seed: int, doing: str) -> PlayedEpisode:
         episode = self._episode(adapter, seed, doing, self._most, share=FIRST)
         if episode.steps < self._most or episode.is_whole:
             return episode
@@ -110,7 +110,7 @@ class Examiner:
         self._found.add("note", f"an episode did not end within {self._most} steps (--steps)")
         return episode
 
-    def _check_seeding(self, adapter: EnvAdapter, first: list[Episode], seed: int) -> None:
+    def _check_seeding(self, adapter: EnvAdapter, first: list[PlayedEpisode], seed: int) -> None:
         """Play the same episodes again, in reverse order, and the first one in new environments."""
         # After the timing, because a global state may be a large image.
         again = [
@@ -120,7 +120,7 @@ class Examiner:
         before = _global_generators()
         anew = self._anew(first[0], seed)
         drawn = [name for name, state in _global_generators().items() if state != before[name]]
-        more: list[Episode] = []
+        more: list[PlayedEpisode] = []
         while drawn and len(more) < REPETITIONS and not self._budget.is_spent(FIRST):
             more.append(self._anew(first[0], seed))
         pairs = [*zip(first, again, strict=True), *((first[0], episode) for episode in (anew, *more))]
@@ -136,12 +136,12 @@ class Examiner:
             ) + "".join(f", and it draws from the generator of the module {name}" for name in drawn)
         self._found.add("fault", text, example=change)
 
-    def _anew(self, episode: Episode, seed: int) -> Episode:
+    def _anew(self, episode: PlayedEpisode, seed: int) -> PlayedEpisode:
         """Play an episode in a new environment."""
         with closing(adapter_for(build(self._config.environment), self._checks)) as fresh:
             return self._episode(fresh, seed, "the first episode in a new environment", episode.steps)
 
-    def _change(self, one: Episode, other: Episode) -> str:
+    def _change(self, one: PlayedEpisode, other: PlayedEpisode) -> str:
         """Describe the first report that differs between two episodes; empty if they are equal."""
         names = ("agent", "observation", "reward", "termination", "truncation")
         for number, (before, after) in enumerate(zip(one.trace, other.trace, strict=False), start=1):
@@ -152,7 +152,7 @@ class Examiner:
 
     def _episode(
         self, adapter: EnvAdapter, seed: int, doing: str, most: int, share: float | None = None, states: bool = False
-    ) -> Episode:
+    ) -> PlayedEpisode:
         """Play an episode with random legal actions.
 
         Args:
@@ -187,7 +187,7 @@ class Examiner:
                     moves.append((agent, self._actions.draw(agent, observation.get(ACTION_MASK))))
             is_late = share is not None and step > 0 and self._budget.is_spent(share)
             if not moves or step == most or is_late:
-                return Episode(trace, step, max(actions), tuple(returns), is_whole=not moves)
+                return PlayedEpisode(trace, step, max(actions), tuple(returns), is_whole=not moves)
             for agent, _ in moves:
                 actions[agent] += 1
             step += 1
@@ -210,7 +210,7 @@ class Examiner:
         else:
             self._found.views_differ = _differ([observation for _, observation, *_ in reports])
 
-    def _check_returns(self, adapter: EnvAdapter, first: list[Episode], seed: int) -> None:
+    def _check_returns(self, adapter: EnvAdapter, first: list[PlayedEpisode], seed: int) -> None:
         """Find agents whose returns agree, as those of a team do."""
         games = [episode.returns for episode in first if episode.is_whole]
         if not games or len(self._agents) == 1:

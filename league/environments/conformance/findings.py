@@ -17,7 +17,7 @@ Trace = list[tuple[int, bytes, float, bool, bool]]
 
 
 @dataclass(frozen=True, slots=True)
-class Episode:
+class PlayedEpisode:
     """A played episode.
 
     Attributes:
