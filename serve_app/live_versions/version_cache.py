@@ -1,6 +1,7 @@
 """Loads versions from the artefact store, verifies their probes, and caches them."""
 
 import asyncio
+import os
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Set
@@ -34,6 +35,9 @@ SHADOW_TIMEOUT = 1.0
 """Seconds after which a run of a shadow is ended, and counted as failed."""
 INLINE_TIMEOUT = 0.5
 """Seconds after which a run on the event loop is ended, and repeated in a thread."""
+RUNS_IN_THREADS = min(32, (os.cpu_count() or 1) + 4) // 2
+"""Runs of one policy in threads at a time: half of the threads of asyncio's default executor, so that a slow policy
+leaves the others to the rest of the replica."""
 WARM_BATCH = 64
 """Large enough to measure the time per row, small enough to run in milliseconds."""
 
@@ -56,8 +60,10 @@ class LoadedPolicy:
     """The same for runs on the event loop."""
     shadow_policy: OnnxPolicy = field(init=False)
     """The same for runs of a shadow, which can be ended."""
+    _threads: asyncio.Semaphore = field(init=False)
 
     def __post_init__(self) -> None:
+        self._threads = asyncio.Semaphore(RUNS_IN_THREADS)
         self.inline_policy = self.policy.within(INLINE_TIMEOUT)
         self.shadow_policy = self.policy.within(SHADOW_TIMEOUT, can_end=True)
 
@@ -68,7 +74,8 @@ class LoadedPolicy:
                 return act(self.inline_policy)
             except GraphTimeout:
                 self.inline_rows = 0
-        return await asyncio.to_thread(act, self.policy)
+        async with self._threads:
+            return await asyncio.to_thread(act, self.policy)
 
     @property
     def samples(self) -> bool:

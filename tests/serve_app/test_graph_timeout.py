@@ -1,9 +1,14 @@
 """A graph that does not end for an observation occupies a replica for a limited time."""
 
+import asyncio
+import threading
+
 import numpy as np
 import pytest
 
 from league.errors import ArtifactCorrupt
+from league.policies.onnx import OnnxPolicy
+from league.policies.policy import Actions
 from league.registry.registry import Registry
 from serve_app.live_versions import version_cache
 from serve_app.live_versions.action_selections import ActionSelections
@@ -49,3 +54,24 @@ def test_a_version_that_does_not_end_is_not_loaded(registry: Registry, monkeypat
     version = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
     with pytest.raises(ArtifactCorrupt, match=r"policy shared of board@4 does not run: .* within 0.2 s"):
         version_cache.load(registry, "board", version, 0.001, ActionSelections(), timeout=0.2)
+
+
+@pytest.mark.anyio
+async def test_a_slow_policy_leaves_threads_to_others(registry: Registry) -> None:
+    """Its callers wait for each other, not all others for them."""
+    version = version_cache.load(registry, "board", 1, 0.0, ActionSelections())
+    policy, ended = version.policy("shared"), threading.Event()
+    policy.inline_rows = 0
+
+    def act(graph: OnnxPolicy) -> Actions:
+        ended.wait()
+        return Actions(np.zeros(1))
+
+    runs = [asyncio.create_task(policy.run(act, 1)) for _ in range(64)]
+    try:
+        await asyncio.sleep(0)
+        assert await asyncio.wait_for(asyncio.to_thread(lambda: "answered"), timeout=60) == "answered"
+        assert not any(run.done() for run in runs)
+    finally:
+        ended.set()
+    await asyncio.gather(*runs)
