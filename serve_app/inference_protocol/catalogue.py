@@ -52,7 +52,7 @@ class ModelCatalogue:
         served = await self._inference.find(model, version)
         league = served.version.league
         try:
-            numbers = (await self._models.query(lambda registry: registry.versions.numbers(league)))[league]
+            numbers = await self._models.in_registry_thread(lambda registry: registry.versions.numbers(league)[league])
         except StorageError:
             numbers = [served.version.number]
         return {
@@ -100,7 +100,7 @@ class ModelCatalogue:
         """What the replicas wrote last. This one writes first, so that no later answer, by any replica, has less."""
         try:
             await self._report()
-            reports = await self._models.query(lambda registry: registry.replicas.reports())
+            reports = await self._models.in_registry_thread(lambda registry: registry.replicas.reports())
         except StorageError:
             return self._inference.statistics.documents()
         return [document for report in reports.values() for document in report.get(REPORT, ())]
@@ -108,7 +108,7 @@ class ModelCatalogue:
     async def index(self, only_ready: bool = False) -> list[Document]:
         """All versions of all policies. Versions in memory are ready; others are loaded on demand. Raises
         StorageError."""
-        policies, numbers = await self._models.query(_models_and_versions)
+        policies, numbers = await self._models.in_registry_thread(_models_and_versions)
         loaded = self._versions.cached_keys()
         return [
             {"name": name, "version": str(number)} | state

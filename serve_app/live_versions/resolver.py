@@ -64,12 +64,12 @@ class ModelResolver:
         loaded = self._versions.cached(ref.league, requested) or await self._versions.get(ref.league, requested)
         return [member.number for member in loaded.members]
 
-    async def query(self, function: Callable[[Registry], T]) -> T:
-        """Query the registry in a thread."""
+    async def in_registry_thread(self, function: Callable[[Registry], T]) -> T:
+        """Call `function` with the registry in one of its threads."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, self._registry)
 
-    async def change(self, function: Callable[[Registry], T], deadline: float) -> T:
-        """Change the registry in a thread, unless `deadline` (a time of `time.monotonic`) passes before.
+    async def in_change_thread(self, function: Callable[[Registry], T], deadline: float) -> T:
+        """Change the registry in a thread for changes, unless `deadline` (of `time.monotonic`) passes before.
 
         Changes wait for locks, so they have threads of their own. Raises DeadlineExceeded.
         """
@@ -88,7 +88,9 @@ class ModelResolver:
     async def _resolve(self, league: str, alias: str) -> LoadedVersion:
         """Resolve an alias without a slot: unknown, created since the last poll, or impossible to load."""
         try:
-            row = await self.query(lambda registry: registry.versions.resolve(CheckpointRef(league, alias)))
+            row = await self.in_registry_thread(
+                lambda registry: registry.versions.resolve(CheckpointRef(league, alias))
+            )
         except UnknownAlias as error:
             if alias != CHAMPION:
                 raise

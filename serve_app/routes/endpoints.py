@@ -70,8 +70,8 @@ def _endpoint(declaration: Declaration, handler: Callable[..., Any], models: Mod
             return _encoded(declaration, request, values, handler(registry, **values))
 
         if declaration.is_change:
-            return _json(declaration, await models.change(encode, request.scope[DEADLINE]))
-        return _json(declaration, await models.query(encode))
+            return _json(declaration, await models.in_change_thread(encode, request.scope[DEADLINE]))
+        return _json(declaration, await models.in_registry_thread(encode))
 
     return respond
 

@@ -126,7 +126,7 @@ class EvaluationRoutes:
                 call=call,
             )
 
-        row = await self._models.change(submit, request.scope[DEADLINE])
+        row = await self._models.in_change_thread(submit, request.scope[DEADLINE])
         evaluation_client.notify()
         headers = {"location": f"{self._settings.root_path}{request.url.path}/{row.id}"}
         content = orjson.dumps(Evaluation.model_validate(row).model_dump())
@@ -147,7 +147,7 @@ class EvaluationRoutes:
         that has ended, so it can be repeated. Completed games stay in the ledger: the same evaluation, started again,
         continues after them.
         """
-        row = await self._models.change(
+        row = await self._models.in_change_thread(
             lambda registry: registry.evaluations.stop(league, evaluation, actor=key.name), request.scope[DEADLINE]
         )
         if self._evaluation_client is not None:

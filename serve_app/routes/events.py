@@ -127,7 +127,7 @@ class EventBroker:
     async def _create_topic(self, query: Query) -> Topic:
         try:
             async with asyncio.timeout(self._settings.timeout):
-                return Topic(query, await self._models.query(query))
+                return Topic(query, await self._models.in_registry_thread(query))
         except TimeoutError:
             raise DeadlineExceeded(f"the request timed out after {self._settings.timeout:g} s") from None
 
@@ -147,7 +147,9 @@ class EventBroker:
         topics = dict(self._topics)
         if not topics:
             return
-        states = await self._models.query(lambda registry: [_state(topic, registry) for topic in topics.values()])
+        states = await self._models.in_registry_thread(
+            lambda registry: [_state(topic, registry) for topic in topics.values()]
+        )
         for (name, topic), state in zip(topics.items(), states, strict=True):
             if isinstance(state, Exception):
                 if not isinstance(state, NotFound):

@@ -178,7 +178,7 @@ class GameRoutes:
             conditions = registry.leagues.get(league).conditions.name
             return GameRequest(league=league, conditions=conditions, operation=build_operation(registry))
 
-        game_request = await self._models.query(build_request)
+        game_request = await self._models.in_registry_thread(build_request)
         return await require_client(self._evaluation_client).request_game(game_request)
 
 

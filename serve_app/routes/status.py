@@ -103,7 +103,7 @@ class StatusRoutes:
 
         Counters never decrease when another replica answers the next scrape.
         """
-        return responses.Response(await self._models.query(_metrics), media_type=CONTENT_TYPE_LATEST)
+        return responses.Response(await self._models.in_registry_thread(_metrics), media_type=CONTENT_TYPE_LATEST)
 
 
 def _metrics(registry: Registry) -> bytes:

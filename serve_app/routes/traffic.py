@@ -117,7 +117,8 @@ class TrafficRoutes:
         """
         shadowings = [shadowing for shadowing in self._shadow.shadowings() if shadowing.league == league]
         statistics = {"replica": self._replica} | _statistics(league, [self._metrics.report()], shadowings)
-        return await self._models.query(lambda registry: _document(registry, league)) | {"here": statistics}
+        document = await self._models.in_registry_thread(lambda registry: _document(registry, league))
+        return document | {"here": statistics}
 
 
 @Declaration(

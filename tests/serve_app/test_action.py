@@ -299,7 +299,7 @@ async def test_the_number_of_other_concurrent_requests_is_limited(registry: Regi
     resume = threading.Event()
     transport = httpx.ASGITransport(server.application())
     async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
-        blocked = [asyncio.create_task(server.models.query(lambda _: resume.wait(60))) for _ in range(4)]
+        blocked = [asyncio.create_task(server.models.in_registry_thread(lambda _: resume.wait(60))) for _ in range(4)]
         slow = [asyncio.create_task(client.get("/v1/leagues")) for _ in range(3)]
         refused, _ = await asyncio.wait(slow, return_when=asyncio.FIRST_COMPLETED)
         (reply,) = [request.result() for request in refused]
