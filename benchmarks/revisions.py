@@ -2,7 +2,8 @@
 
 Both checkouts use the installed dependencies. Each measures itself with its own benchmark modules, in a process of its
 own; they alternate within a round, each second round in reverse order, and a ratio is the median over the rounds. Rates
-are those of one core, except for serving, where the server, HAProxy and the load generator share all cores.
+are those of a second of processor time, except for serving, where the server, HAProxy and the load generator share all
+cores.
 """
 
 import os
@@ -33,9 +34,9 @@ home = Path(tempfile.mkdtemp(dir=sys.argv[1]))
 
 
 def repeat(step, seconds):
-    "Results of `step` per second, summed."
-    done, start = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - start) < seconds:
+    "Results of `step` per second of processor time, summed."
+    done, start = 0, time.process_time()
+    while (elapsed := time.process_time() - start) < seconds:
         done += step()
     return done / elapsed
 
