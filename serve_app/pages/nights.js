@@ -10,7 +10,7 @@ import { range } from "./strength.js";
 import { interval, number, percent, shortRef, signed } from "./format.js";
 
 export function Nights({ league }) {
-  const nights = useList(apiPath(league, "nights"), "nights", useChangeToken("runs", "computed_at", "aliases"));
+  const nights = useList(apiPath(league, "training-nights"), "training_nights", useChangeToken("runs", "computed_at", "aliases"));
   return html`<section aria-labelledby="heading">
     <div class="head"><h2 id="heading">Nights of training</h2></div>
     <${Await} result=${nights}>${nights.items && (nights.items.length
@@ -63,7 +63,7 @@ function Charts({ nights }) {
 
 function List({ league, nights }) {
   const head = [["Night", "number"], ["Started"], ["Versions"], ["Champion"], [html`<${Term} name="rating">Rating<//>`, "number"], ["95 % interval"], ["Exploiter's score", "number"], ["Return gain", "number"], ["Errors"]];
-  return html`<${Table} caption="Nights, newest first" head=${head} cls="full">${nights.map((night) => html`<${Row} key=${night.night} league=${league} night=${night} />`)}<//>`;
+  return html`<${Table} caption="Nights, newest first" head=${head} cls="full">${nights.map((night) => html`<${Row} key=${night.training_night} league=${league} night=${night} />`)}<//>`;
 }
 
 function Row({ league, night: { number: place, run, exploiter_run: exploiterRun, parent, versions, champion, champion_before: before, rating, interval: bounds, exploitability, errors, began_at: began, ended_at: ended } }) {

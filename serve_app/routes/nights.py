@@ -35,10 +35,10 @@ class ChampionExploitability(Response):
     gain: Gain | None
 
 
-class Night(Response):
+class TrainingNight(Response):
     """A night of training. Results of steps that are not complete yet are null or empty."""
 
-    night: int = Field(description="Its id, unique among all leagues.")
+    training_night: int = Field(description="Its id, unique among all leagues.")
     number: int = Field(description="Its place among the nights of the league, from 1.")
     run: str = Field(description="Its training run.")
     exploiter_run: str | None = Field(description="The training run of the champion's exploiter.")
@@ -81,8 +81,14 @@ class NightlyRun(Response):
     ended_at: datetime | None
 
 
-@Declaration("GET", "/v1/leagues/{league}/nights", Page("nights", Night, "night"), scope="read", tag="Results")
-def nights(registry: Registry, league: str, limit: int, before: int | None) -> Sequence[Night]:
+@Declaration(
+    "GET",
+    "/v1/leagues/{league}/training-nights",
+    Page("training_nights", TrainingNight, "training_night"),
+    scope="read",
+    tag="Results",
+)
+def training_nights(registry: Registry, league: str, limit: int, before: int | None) -> Sequence[TrainingNight]:
     """List nights of training.
 
     The nights of `league nightly --train`, newest first.
@@ -90,7 +96,7 @@ def nights(registry: Registry, league: str, limit: int, before: int | None) -> S
     rows = [row for row in reversed(registry.training_nights.all(league)) if before is None or row.id < before]
     snapshot = registry.snapshots.get(league, RATINGS)
     ratings = {} if snapshot is None else {rating["ref"]: rating for rating in snapshot.document["versions"]}
-    return [_night(row, ratings) for row in rows[:limit]]
+    return [_training_night(row, ratings) for row in rows[:limit]]
 
 
 @Declaration(
@@ -127,12 +133,12 @@ def _nightly_run(row: NightlyRunRow) -> NightlyRun:
     )
 
 
-def _night(row: TrainingNightRow, ratings: Mapping[str, Any]) -> Night:
+def _training_night(row: TrainingNightRow, ratings: Mapping[str, Any]) -> TrainingNight:
     train, gate, measured = (row.steps.get(step, {}) for step in ("train", "gate", "measure"))
     champion = gate.get("champion")
     rated = ratings.get(champion, {})
-    return Night(
-        night=row.id,
+    return TrainingNight(
+        training_night=row.id,
         number=row.number,
         run=row.run,
         exploiter_run=row.steps.get("exploiter", {}).get("run"),

@@ -234,7 +234,7 @@ def test_a_run_has_the_strength_of_its_versions(reader: TestClient) -> None:
 
 
 def test_nights_have_the_strength_and_the_exploitability_of_their_champions(reader: TestClient) -> None:
-    (open_night,), (night,) = pages(reader, f"{BOARD}/nights", "Nights", "nights", limit=1)
+    (open_night,), (night,) = pages(reader, f"{BOARD}/training-nights", "TrainingNights", "training_nights", limit=1)
     assert (night["versions"], night["champion_before"], night["champion"]) == (["board@2"], "board@1", "board@2")
     assert [(each["number"], each["parent"]) for each in (open_night, night)] == [(2, 2), (1, 3)]
     assert (night["rating"], night["errors"]) == (200.0, ["exploiter: the disk is full"])
@@ -243,7 +243,7 @@ def test_nights_have_the_strength_and_the_exploitability_of_their_champions(read
     unknown = {name: open_night[name] for name in ("champion", "rating", "exploitability", "ended_at")}
     assert unknown == dict.fromkeys(unknown), "its steps are not complete"
     assert open_night["versions"] == []
-    assert get(reader, "/v1/leagues/memory/nights", "Nights")["nights"] == []
+    assert get(reader, "/v1/leagues/memory/training-nights", "TrainingNights")["training_nights"] == []
 
 
 def test_nightly_runs_have_their_verdicts(reader: TestClient) -> None:
