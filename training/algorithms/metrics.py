@@ -1,6 +1,6 @@
 """Extracts a run's metrics from RLlib's results: return, length, loss, entropy, KL per policy and agent.
 
-docs/training.md explains the curves. In addition: `episodes` and `crashes`, the episodes that ended and that were lost
+docs/curves.md explains the curves. In addition: `episodes` and `crashes`, the episodes that ended and that were lost
 because the environment raised; `agents/<agent>/return` and `length` of one agent; `time/<phase>`, wall time since the
 last report in seconds, with `time/other` for the rest; with a GPU, `gpu/memory_gb`, the learner's peak memory, and
 `gpu/utilization`. A centralised off-policy learner reports under `joint`.
