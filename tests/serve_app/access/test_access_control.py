@@ -103,7 +103,7 @@ def test_browsers_do_not_guess_the_type_of_a_response(read_only_client: TestClie
 
 def test_an_error_of_ours_has_the_headers_of_a_response(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
     server = Replica(Registry.open(storage), QUICK, "replica-1")
-    monkeypatch.setattr(server.models, "query", None)
+    monkeypatch.setattr(server.models, "in_registry_thread", None)
     application = server.application()
     with TestClient(application, base_url=LOCALHOST, raise_server_exceptions=False) as client:
         response = client.get("/v1/leagues")
