@@ -1,4 +1,4 @@
-"""Is this code as fast as another checkout of it: serving, sampling, stepping and a tournament?
+"""Is this code as fast as another checkout of it: serving, sampling, training, stepping and a tournament?
 
 Both checkouts use the installed dependencies. Each measures itself with its own benchmark modules, in a process of its
 own; they alternate within a round, each second round in reverse order, and a ratio is the median over the rounds. Rates
@@ -97,6 +97,40 @@ def play():
 def rate(seconds):
     return repeat(play, seconds)
 """
+TRAINING = """
+import torch
+from benchmarks import sampling
+from benchmarks.harness import CONFIGS
+from benchmarks.training.learned import local_ray
+from league.config.league import LeagueConfig
+from league.environments.building import interface
+from training.runs.trial import build_algorithm
+
+if {mlp}:
+    league = sampling.league(sampling.FOUR, num_envs="auto", **{settings})
+else:
+    league = LeagueConfig.load(CONFIGS / "connect_four.yaml").with_training(runners=0, **{settings})
+ray = local_ray(cpus=1)
+ray.__enter__()
+torch.set_num_threads(1)
+algorithm = build_algorithm(league, interface(league))
+algorithm.reset_episodes(0)
+chunks, _ = algorithm.sample_train_batch()
+
+
+def update():
+    return algorithm.learner_group.update(
+        episodes=chunks,
+        policies=tuple(algorithm.config.policies),
+        progress=algorithm.progress,
+        num_epochs=algorithm.config.num_epochs,
+        minibatch_size=algorithm.config.minibatch_size,
+    )
+
+
+def rate(seconds):
+    return repeat(lambda: {step}() and algorithm.config.total_train_batch_size, seconds)
+"""
 TOURNAMENT = """
 from benchmarks import evaluation
 from benchmarks.leagues import evaluated_league
@@ -125,6 +159,8 @@ def rate(seconds):
     with _ours(storage, 1) as url:
         return measure(url, BODY, connections=32, seconds=10 * seconds, warm_up=4).rate
 """
+MLP = {"train_batch_size": 4096, "minibatch_size": 512}
+CONVOLUTIONAL = {"train_batch_size": 8192, "minibatch_size": 1024, "teacher": None, "opponents": []}
 PARTS = {
     "stepping connect_four": STEPPING.format(case="connect_four"),
     "stepping simple_spread": STEPPING.format(case="simple_spread"),
@@ -132,6 +168,11 @@ PARTS = {
     "sampling simple_spread": SAMPLING.format(environment="SPREAD"),
     "sampling leduc by PPO": LEDUC.format(algorithm="ppo"),
     "sampling leduc by DQN": LEDUC.format(algorithm="dqn"),
+    "update MLP": TRAINING.format(mlp=True, settings=MLP, step="update"),
+    "update convolutional": TRAINING.format(mlp=False, settings=CONVOLUTIONAL, step="update"),
+    "iteration MLP": TRAINING.format(mlp=True, settings=MLP, step="algorithm.train"),
+    "iteration convolutional": TRAINING.format(mlp=False, settings=CONVOLUTIONAL, step="algorithm.train"),
+    "iteration as shipped": TRAINING.format(mlp=False, settings={}, step="algorithm.train"),
     "tournament MLP": TOURNAMENT.format(mlp=True),
     "tournament convolutional": TOURNAMENT.format(mlp=False),
     "serving": SERVING,

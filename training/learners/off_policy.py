@@ -5,7 +5,6 @@ overrides `learn`, using `gradient_step`, `update_targets` and `log_statistics`.
 """
 
 import copy
-import logging
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -19,6 +18,8 @@ from torch import Tensor, nn
 from league.config.league import LeagueConfig
 from league.config.off_policy import OffPolicyConfig
 from league.interface import Interface
+from training.learners.optimizer import ClippedAdam, warn_of_dropped_gradients
+from training.learners.processor import keep_memory
 from training.modules.policy_module import MASKED_LOGIT
 from training.replay_buffer import Sample
 from training.rllib_compat import FixedPoliciesLearner, includes_component
@@ -84,8 +85,6 @@ def project_distribution(
     return (shares * probabilities.unsqueeze(1)).sum(-1)
 
 
-logger = logging.getLogger(__name__)
-
 OFF_POLICY = "off_policy"
 """The component of the learner's state that RLlib does not know."""
 
@@ -138,6 +137,7 @@ class OffPolicyLearner(FixedPoliciesLearner):
         self.settings = settings
         self.interface = Interface.model_validate(self.config.env_config[INTERFACE])
         self.updates = 0
+        keep_memory()
         self._statistics: dict[str, dict[str, list[Tensor]]] = defaultdict(lambda: defaultdict(list))
         super().build()
 
@@ -146,12 +146,12 @@ class OffPolicyLearner(FixedPoliciesLearner):
         self.networks: dict[str, nn.Module] = dict(self.module.items())
         self.networks |= {name: network.to(self.device) for name, network in self.extra_networks().items()}
         self.targets = {name: copy.deepcopy(net).requires_grad_(False) for name, net in self.networks.items()}
-        self._parameters: dict[str, list[nn.Parameter]] = {}
+        self._optimizers: dict[str, ClippedAdam] = {}
         for name, network in self.networks.items():
             parameters = list(network.parameters())
-            optimizer = torch.optim.Adam(parameters, lr=self.settings.lr, fused=True)
+            optimizer = ClippedAdam(parameters, lr=self.settings.lr, max_norm=self.settings.grad_clip)
             self.register_optimizer(module_id=name, optimizer=optimizer, params=parameters)
-            self._parameters[name] = parameters
+            self._optimizers[name] = optimizer
 
     def compute_loss_for_module(self, **_: Any) -> Tensor:
         """Raise NotImplementedError. RLlib calls this from its own `update` only; see `learn`."""
@@ -178,18 +178,11 @@ class OffPolicyLearner(FixedPoliciesLearner):
         Gradients that are not finite are dropped. Returns network → gradient norm.
         """
         names = [name for name in self.networks if name in networks]
-        parameters = [parameter for name in names for parameter in self._parameters[name]]
+        parameters = [parameter for name in names for parameter in self.networks[name].parameters()]
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
-        norms = {}
-        for name in names:
-            norms[name] = nn.utils.clip_grad_norm_(self._parameters[name], self.settings.grad_clip)
-            if torch.isfinite(norms[name]):
-                self.get_optimizer(module_id=name).step()
-            else:
-                logger.warning("Dropped a non-finite gradient of %s.", name)
-        return norms
+        return {name: self._optimizers[name].clip_and_step() for name in names}
 
     @torch.no_grad()
     def update_targets(self) -> None:
@@ -216,6 +209,7 @@ class OffPolicyLearner(FixedPoliciesLearner):
         for key, statistics in noted.items():
             means = {name: float(torch.stack(values).mean()) for name, values in statistics.items()}
             self.metrics.log_dict(means, key=key, window=1)
+        warn_of_dropped_gradients(self._optimizers)
         metrics = self.metrics.reduce()
         return {key: metrics[key] for key in noted}
 

@@ -1,6 +1,5 @@
 """The PPO learner: the clipped surrogate loss and the update loop that minimises it."""
 
-import logging
 from collections import defaultdict
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields, replace
@@ -18,6 +17,8 @@ from league.config.schedules import Scheduled, ScheduleProgress, scheduled_value
 from league.errors import ConfigError
 from league.interface import Interface
 from training.learners.magnet import Magnet, Previous, magnet, states
+from training.learners.optimizer import ClippedAdam, warn_of_dropped_gradients
+from training.learners.processor import fast_products, keep_memory
 from training.learners.teacher import Teacher
 from training.learners.train_batch import (
     Bootstraps,
@@ -136,8 +137,6 @@ def ppo_loss(
     return PPOLoss(total, policy, value, mean_entropy, (clipped != ratio).float().mean(), magnet_kl, cross_entropy)
 
 
-logger = logging.getLogger(__name__)
-
 MAGNET_KL, MAGNET_WEIGHT = "magnet_kl", "magnet_weight"
 """Logged only with a magnet, the weight only if it has a schedule."""
 TEACHER_LOSS, TEACHER_WEIGHT = "teacher_loss", "teacher_weight"
@@ -173,6 +172,7 @@ class PPOLearner(FixedPoliciesLearner):
         assert isinstance(settings, PPOConfig)
         self.settings = settings
         self._set_hyperparameters(NOT_STARTED)
+        keep_memory()
         super().build()
         interface = Interface.model_validate(self.config.env_config[INTERFACE])
         storage = self.config.env_config.get(STORAGE)
@@ -191,7 +191,7 @@ class PPOLearner(FixedPoliciesLearner):
         """Create an Adam optimiser for each policy's own parameters, and one for a shared encoder."""
         shared = self.module.encoder if isinstance(self.module, SharedEncoder) else None
         common = list(shared.parameters()) if shared is not None else []
-        self._parameters: dict[str, list[torch.nn.Parameter]] = {}
+        self._optimizers: dict[str, ClippedAdam] = {}
         for policy, module in self.module.items():
             own_parameters = [
                 parameter for parameter in module.parameters() if not any(parameter is other for other in common)
@@ -226,29 +226,36 @@ class PPOLearner(FixedPoliciesLearner):
             self._magnet.before_update(self.weights_version, self.module)
         self.weights_version += 1
         self._set_hyperparameters(progress)
-        batches = self._batches(training_data.episodes, self.module.keys() if policies is None else policies)
-        if batches:
-            size = minibatch_size or max(len(batch) for batch in batches.values())
-            statistics: dict[str, list[Tensor]] = defaultdict(list)
-            for minibatch in minibatches(batches, size=size, epochs=num_epochs):
-                for parameters in self._parameters.values():
-                    for parameter in parameters:
-                        parameter.grad = None
-                answers = self.module.forward_train({policy: steps.inputs for policy, steps in minibatch.items()})
-                losses = {
-                    policy: self.compute_loss_for_module(module_id=policy, batch=steps, fwd_out=answers[policy])
-                    for policy, steps in minibatch.items()
-                }
-                torch.autograd.backward([loss.total for loss in losses.values()])
-                names = [name for name in self._parameters if name in minibatch or name == ALL_MODULES]
-                norms = {name: self._clip_and_step(name) for name in names}
-                for policy, loss in losses.items():
-                    row = torch.stack([*loss[1:-2], norms[policy], loss.magnet_kl, loss.teacher])
-                    statistics[policy].append(row.detach())
-            self._log(batches, statistics)
+        with fast_products():
+            batches = self._batches(training_data.episodes, self.module.keys() if policies is None else policies)
+            if batches:
+                size = minibatch_size or max(len(batch) for batch in batches.values())
+                self._log(batches, self._gradient_steps(minibatches(batches, size=size, epochs=num_epochs)))
+                warn_of_dropped_gradients(self._optimizers)
         metrics = self.metrics.reduce()
         # RLlib reports NaN for policies that were logged earlier but not in this update.
         return {policy: metrics[policy] for policy in batches}
+
+    def _gradient_steps(self, drawn: Iterable[dict[str, Minibatch]]) -> dict[str, list[Tensor]]:
+        """Take a gradient step per minibatch; return policy id → statistics of its steps."""
+        for name, optimizer in self._optimizers.items():
+            optimizer.param_groups[0]["lr"] = self._lr(name)
+        statistics = defaultdict(list)
+        for minibatch in drawn:
+            for optimizer in self._optimizers.values():
+                optimizer.zero_grad()
+            answers = self.module.forward_train({policy: steps.inputs for policy, steps in minibatch.items()})
+            losses = {
+                policy: self.compute_loss_for_module(module_id=policy, batch=steps, fwd_out=answers[policy])
+                for policy, steps in minibatch.items()
+            }
+            torch.autograd.backward([loss.total for loss in losses.values()])
+            names = [name for name in self._optimizers if name in minibatch or name == ALL_MODULES]
+            norms = {name: self._optimizers[name].clip_and_step() for name in names}
+            for policy, loss in losses.items():
+                row = torch.stack([*loss[1:-2], norms[policy], loss.magnet_kl, loss.teacher])
+                statistics[policy].append(row.detach())
+        return statistics
 
     def _set_hyperparameters(self, progress: ScheduleProgress) -> None:
         self.hyperparameters = hyperparameters(self.settings, tuple(self.config.policies), progress)
@@ -297,17 +304,6 @@ class PPOLearner(FixedPoliciesLearner):
             teacher=self._teacher_weight,
         )
 
-    def _clip_and_step(self, name: str) -> Tensor:
-        """Clip the gradients of one optimiser by their global norm, and step unless they are not finite."""
-        norm = torch.nn.utils.clip_grad_norm_(self._parameters[name], self.settings.grad_clip)
-        if torch.isfinite(norm):
-            optimizer = self.get_optimizer(module_id=name)
-            optimizer.param_groups[0]["lr"] = self._lr(name)
-            optimizer.step()
-        else:
-            logger.warning("Dropped a non-finite gradient of %s.", name)
-        return norm
-
     def _lr(self, name: str) -> float:
         """Return the current learning rate of a policy, or of a shared encoder."""
         return self._common_lr if name == ALL_MODULES else self.hyperparameters[name].lr
@@ -332,9 +328,9 @@ class PPOLearner(FixedPoliciesLearner):
             self._magnet.set_state(state.get(MAGNET) or states(self.module))
 
     def _add_optimizer(self, name: str, parameters: list[torch.nn.Parameter]) -> None:
-        optimizer = torch.optim.Adam(parameters, lr=self._lr(name), eps=ADAM_EPSILON, fused=True)
+        optimizer = ClippedAdam(parameters, lr=self._lr(name), max_norm=self.settings.grad_clip, eps=ADAM_EPSILON)
         self.register_optimizer(module_id=name, optimizer=optimizer, params=parameters)
-        self._parameters[name] = parameters
+        self._optimizers[name] = optimizer
 
     def _log(self, batches: dict[str, TrainBatch], statistics: dict[str, list[Tensor]]) -> None:
         divergences = self._divergences(batches)
