@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import os
+import signal
 import socket
+import threading
 import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
@@ -96,13 +98,11 @@ def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
     for attempt in range(ATTEMPTS):
         try:
             with loopback_node():
-                context = ray.init(
+                dashboard = _connect(
                     address="local",
                     num_cpus=local.cpus,
                     object_store_memory=None if local.object_store is None else local.object_store * 10**6,
                     include_dashboard=local.dashboard,
-                    log_to_driver=False,
-                    logging_level=logging.ERROR,
                     **options,
                 )
             break
@@ -111,7 +111,7 @@ def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
                 raise NotReady(f"Ray did not start: {error}") from error
         except Exception as error:
             raise NotReady(f"Ray did not start: {one_line(error)}") from error
-    return context.dashboard_url
+    return dashboard
 
 
 def join(address: str, **options: Any) -> str | None:
@@ -127,12 +127,25 @@ def join(address: str, **options: Any) -> str | None:
         if colon and port.isdigit() and "/" not in host:
             socket.create_connection((host, int(port)), timeout=CONNECT_TIMEOUT).close()
         with loopback_addresses():
-            context = ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+            return _connect(address=address, **options)
     except (OSError, ValueError, ray.exceptions.AuthenticationError) as error:
         raise ConfigError(
             f"no Ray cluster at {address!r}: {one_line(error)} (if it requires a token, as `ray start`"
             " does by default: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN on other machines)"
         ) from error
+
+
+def _connect(**options: Any) -> str | None:
+    """Call `ray.init` with some arguments, and return the address of the dashboard, if there is one.
+
+    Ray's core puts a handler of SIGTERM before Python's, which prints a stack and aborts the process if that takes 3 s.
+    Setting Python's once more removes it.
+    """
+    import ray
+
+    context = ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     return context.dashboard_url
 
 

@@ -71,6 +71,7 @@ def test_a_terminated_evaluation_exits_like_any_terminated_process(registry: Reg
         _, errors = process.communicate()
     assert process.returncode == 143, errors
     assert "Traceback" not in errors
+    assert "SIGTERM received" not in errors  # Ray's handler, which aborts the process if printing is slow
 
 
 def test_nightly_tests_promotes_and_rates_and_the_next_run_has_nothing_to_do(
