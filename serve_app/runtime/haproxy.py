@@ -29,13 +29,13 @@ DIRECTORIES = Path("/tmp")
 PREFIX = "league-serve-"
 """Short, because the path of HAProxy's socket is limited to 97 characters, of which Ray adds 57."""
 LOCK = "lock"
-PORTS = range(20_000, 30_000)
-"""Range of free ports: below the kernel's ephemeral ports."""
+PORTS = range(25_000, 30_000)
+"""Range of free ports: below the kernel's ephemeral ports, and apart from the claimed blocks."""
 GRPC_PORT_FILE = "grpc"
 """File with the first gRPC port that a server has claimed."""
-GRPC_PORTS = range(10_000, 20_000, 100)
+GRPC_PORTS = range(10_000, 15_000, 100)
 """First ports of the blocks for the gRPC servers of replicas; a block exceeds the number of replicas of a machine."""
-DISTANCE = PORTS.start - GRPC_PORTS.start
+DISTANCE = 10_000
 """From a claimed block to that of the other ports of the same server, which are bound seconds later."""
 SOFT_STOP_TIMEOUT = 1.0
 """Seconds for HAProxy to finish requests in progress."""

@@ -98,6 +98,7 @@ def test_servers_that_start_at_the_same_time_do_not_draw_the_same_ports(director
             first, _last = (ports.pop(f"RAY_SERVE_DIRECT_INGRESS_{end}_GRPC_PORT") for end in ("MIN", "MAX"))
             own = range(first + haproxy.DISTANCE, first + haproxy.DISTANCE + haproxy.GRPC_PORTS.step)
             assert len(ports) == len({*ports.values()} & {*own}) == 4
+            assert not {*own} & {*haproxy.PORTS}
             claimed.append(first)
     assert len(set(claimed)) == 5
 
