@@ -159,7 +159,7 @@ MUTANTS = [
     (WRAPPING, "np.clip(rewards, lowest", "np.float32(1) * np.clip(rewards.astype(np.float32), lowest"),
     (WRAPPING, "np.lexsort((rows.agents, rows.envs))", "np.argsort(rows.agents, kind='stable')"),
     (WRAPPING, "rows.envs * len(self.possible_agents) + rows.agents", "rows.agents"),
-    (WRAPPING, ".astype(self._dtypes[rows.agents[0]], copy=False)", ".astype(np.float32)"),
+    (WRAPPING, ".astype(self._dtypes[agent], copy=False)", ".astype(np.float32)"),
 ]
 
 

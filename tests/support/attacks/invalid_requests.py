@@ -86,7 +86,8 @@ def _from_document(client: httpx.Client, statuses: Counter[str], count: int, num
     schema = schemathesis.openapi.from_dict(client.get("/openapi.json").json())
     operations = [operation.ok() for operation in schema.get_all_operations()]
     acting = [operation for operation in operations if operation.path in ROUTES]
-    names = {"model": LEAGUE, "league": LEAGUE, "alias": "candidate", "version": "1"}
+    names = {"model": LEAGUE, "league": LEAGUE, "alias": "candidate", "version": "1", "position": 0}
+    names |= dict.fromkeys(("evaluation", "game", "run", "schedule", "verdict"), "1")
     left = count
 
     @seed(number)
