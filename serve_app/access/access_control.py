@@ -181,18 +181,16 @@ class AccessControl:
             return None
         key = None if token is None else self._api_keys.find(token)
         if key is None:
-            raise Unauthenticated(self._why_not(need, token))
+            if self._api_keys.is_empty:
+                create = f"league keys create NAME --scope {need.scope}"
+                raise Unauthenticated(f"this request requires an API key, and none exists: {create}")
+            if token is None:
+                raise Unauthenticated("this request requires an API key: Authorization: Bearer plk_…")
+            raise Unauthenticated(INVALID_KEY)
         if need.scope not in key.scopes:
             allowed = ", ".join(sorted(key.scopes))
             raise Forbidden(f"this request requires the scope {need.scope}; the key {key.name} has {allowed}")
         return key
-
-    def _why_not(self, need: RequiredPermission, token: bytes | None) -> str:
-        if self._api_keys.is_empty:
-            return f"this request requires an API key, and none exists: league keys create NAME --scope {need.scope}"
-        if token is None:
-            return "this request requires an API key: Authorization: Bearer plk_…"
-        return INVALID_KEY
 
 
 class AccessControlMiddleware:

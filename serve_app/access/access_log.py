@@ -57,7 +57,8 @@ class AccessLog:
             is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
             if is_end or message["type"] == "websocket.close":
                 line["time"], line["us"] = datetime.now(UTC), (perf_counter_ns() - start) // 1000
-                self._append(line)
+                if len(self._lines) < MAX_BUFFERED:
+                    self._lines.append(line)
 
         return noting
 
@@ -75,10 +76,6 @@ class AccessLog:
             self._thread.shutdown()
             if self._file is not None:
                 self._file.close()
-
-    def _append(self, line: dict[str, Any]) -> None:
-        if len(self._lines) < MAX_BUFFERED:
-            self._lines.append(line)
 
     async def _write_on(self) -> None:
         while True:

@@ -129,12 +129,12 @@ class ErrorHandlers:
         path, headers = request.url.path[:200], error.headers
         message = f"no route matches {path}" if error.status_code == 404 else error.detail
         if error.status_code == 405:
-            methods = _methods(request)
+            # The router names the methods of the first route that matches the path, not of all.
+            matching = (route for route in request.app.routes if route.matches(request.scope)[0] is Match.PARTIAL)
+            methods = sorted({method for route in matching for method in route.methods})
             expected = " or ".join(method for method in methods if method != "HEAD")
-            message, headers = (
-                f"{request.method} is not allowed for {path}: use {expected}",
-                {"allow": ", ".join(methods)},
-            )
+            message = f"{request.method} is not allowed for {path}: use {expected}"
+            headers = {"allow": ", ".join(methods)}
         code = CODES.get(error.status_code, "http_error")
         self._count(request.scope["path"], code)
         return error_response(request.scope["path"], error.status_code, code, message, headers)
@@ -145,12 +145,6 @@ class ErrorHandlers:
         self._count(request.scope["path"], "internal_error")
         message, headers = "internal server error; see the server log", {"x-content-type-options": "nosniff"}
         return error_response(request.scope["path"], 500, "internal_error", message, headers)
-
-
-def _methods(request: Request) -> list[str]:
-    """The methods of all routes that match the path of a request, of which the router names those of the first."""
-    routes = (route for route in request.app.routes if route.matches(request.scope)[0] is Match.PARTIAL)
-    return sorted({method for route in routes for method in route.methods})
 
 
 def error_response(path: str, status: int, code: str, message: str, headers: Any = None) -> Response:

@@ -18,6 +18,7 @@ JSON_TYPES = (b"application/json", b"text/json", b"text/plain", b"application/x-
 """Media types accepted as JSON. The last is curl's default."""
 WINDOW_BITS = {b"gzip": 31, b"x-gzip": 31, b"deflate": 15}
 """Content-Encoding → zlib's `wbits`, which select the format."""
+UNCOMPRESSED = (b"", b"identity")
 MAX_CHANGE_BODY = 64 * 1024
 """Limit of bodies that are not inference requests: they hold names, numbers and a reason."""
 BODY_READ = "league.body_is_read"
@@ -28,7 +29,10 @@ async def read_body(scope: Scope, receive: Receive, limit: int) -> bytes:
     """Read a JSON body of at most `limit` bytes. Raises the errors of `read_bytes`, or UnsupportedMediaType."""
     for name, value in scope["headers"]:
         if name == b"content-type":
-            _check_type(value)
+            media_type = value.partition(b";")[0].strip().lower()
+            if media_type not in JSON_TYPES and not media_type.endswith(b"+json"):
+                type_name = media_type.decode("latin-1")[:64]
+                raise UnsupportedMediaType(f"the Content-Type is {type_name!r}, expected application/json")
     return await read_bytes(scope, receive, limit)
 
 
@@ -43,17 +47,25 @@ async def read_bytes(scope: Scope, receive: Receive, limit: int) -> bytes:
         if name == b"content-length" and int(value) > limit:
             raise _too_large(limit)
         if name == b"content-encoding":
-            encoding = _known_encoding(value)
-    message = await receive()
-    if message["type"] == "http.disconnect":
-        raise _incomplete()
-    body: bytes = message.get("body", b"")
-    if message.get("more_body", False):
-        body = await _read_rest(body, receive, limit)
-    if len(body) > limit:
+            encoding = value.strip().lower()
+            if encoding not in WINDOW_BITS and encoding not in UNCOMPRESSED:
+                encoding_name = encoding.decode("latin-1")[:64]
+                raise UnsupportedMediaType(
+                    f"the Content-Encoding is {encoding_name!r}, expected gzip, deflate or identity"
+                )
+    parts, size, more = list[bytes](), 0, True
+    while more and size <= limit:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            raise MalformedBody("the connection closed before the body was complete")
+        parts.append(message.get("body", b""))
+        size += len(parts[-1])
+        more = message.get("more_body", False)
+    if size > limit:
         raise _too_large(limit)
     scope[BODY_READ] = True
-    return await decompressed(body, encoding, limit) if encoding else body
+    body = b"".join(parts)
+    return body if encoding in UNCOMPRESSED else await decompressed(body, encoding, limit)
 
 
 async def decompressed(body: bytes, encoding: bytes, limit: int) -> bytes:
@@ -73,29 +85,6 @@ def parse_json_object(body: bytes) -> dict[str, Any]:
     return document
 
 
-async def _read_rest(body: bytes, receive: Receive, limit: int) -> bytes:
-    parts, size, more = [body], len(body), True
-    while more and size <= limit:
-        message = await receive()
-        if message["type"] == "http.disconnect":
-            raise _incomplete()
-        parts.append(message.get("body", b""))
-        size += len(parts[-1])
-        more = message.get("more_body", False)
-    return b"".join(parts)
-
-
-def _known_encoding(value: bytes) -> bytes:
-    """The Content-Encoding, empty if the body is not compressed. Raises UnsupportedMediaType."""
-    encoding = value.strip().lower()
-    if encoding in (b"", b"identity"):
-        return b""
-    if encoding not in WINDOW_BITS:
-        encoding_name = encoding.decode("latin-1")[:64]
-        raise UnsupportedMediaType(f"the Content-Encoding is {encoding_name!r}, expected gzip, deflate or identity")
-    return encoding
-
-
 def _inflate(body: bytes, window_bits: int, limit: int) -> bytes:
     inflater = zlib.decompressobj(window_bits)
     try:
@@ -107,17 +96,6 @@ def _inflate(body: bytes, window_bits: int, limit: int) -> bytes:
     if not inflater.eof or inflater.unused_data:
         raise MalformedBody("the compressed body is truncated or followed by other data")
     return inflated
-
-
-def _check_type(value: bytes) -> None:
-    media_type = value.partition(b";")[0].strip().lower()
-    if media_type not in JSON_TYPES and not media_type.endswith(b"+json"):
-        type_name = media_type.decode("latin-1")[:64]
-        raise UnsupportedMediaType(f"the Content-Type is {type_name!r}, expected application/json")
-
-
-def _incomplete() -> MalformedBody:
-    return MalformedBody("the connection closed before the body was complete")
 
 
 def _too_large(limit: int) -> BodyTooLarge:

@@ -35,7 +35,10 @@ def reject_cross_site(kind: str, method: str, headers: Iterable[tuple[bytes, byt
     values = dict(headers)
     site, origin = values.get(b"sec-fetch-site"), values.get(b"origin")
     # "same-site" is not enough: it includes pages on other ports of this machine.
-    is_ours = site in SAME_ORIGIN if site is not None else origin is None or _authority(origin) == values.get(b"host")
+    if site is not None:
+        is_ours = site in SAME_ORIGIN
+    else:  # the opaque origin, `null`, has no host
+        is_ours = origin is None or origin.partition(b"://")[2] == values.get(b"host")
     if not is_ours:
         sender = (origin or b"another origin").decode("latin-1")[:100]
         raise CrossSiteRequest(f"cross-site request from {sender} refused: only pages of this server may send it")
@@ -62,8 +65,3 @@ def _is_loopback(authority: bytes) -> bool:
         return ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def _authority(origin: bytes) -> bytes:
-    """Host and port of an origin; empty for `null`, the opaque origin."""
-    return origin.partition(b"://")[2]

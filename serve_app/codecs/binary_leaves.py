@@ -10,7 +10,7 @@ is decoded.
 
 import binascii
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from io import BytesIO
 from math import prod
 from typing import Any
@@ -125,20 +125,17 @@ def _check_header(name: str, picture: bytes, height: int, width: int) -> int:
 def _decode_pixels(name: str, picture: bytes, height: int, width: int) -> NDArray:
     """Pixels, (height, width, channels) uint8."""
     try:
-        with Image.open(BytesIO(b"".join((picture[:BODY], *_pixel_chunks(picture)))), formats=("PNG",)) as image:
+        parts, at = [picture[:BODY]], BODY
+        while at < len(picture):
+            length, chunk = CHUNK.unpack_from(picture, at)
+            end = at + CHUNK.size + length + CRC
+            if chunk in PIXELS:
+                parts.append(picture[at:end])
+            at = end
+        with Image.open(BytesIO(b"".join(parts)), formats=("PNG",)) as image:
             return np.asarray(image).reshape(height, width, -1)
     except (OSError, SyntaxError, ValueError, struct.error, EOFError) as error:
         raise ObservationError(f"{name}.png cannot be decoded: {one_line(error)[:200]}") from None
-
-
-def _pixel_chunks(picture: bytes) -> Iterator[bytes]:
-    at = BODY
-    while at < len(picture):
-        length, name = CHUNK.unpack_from(picture, at)
-        end = at + CHUNK.size + length + CRC
-        if name in PIXELS:
-            yield picture[at:end]
-        at = end
 
 
 def _decode_base64(name: str, text: Any) -> bytes:

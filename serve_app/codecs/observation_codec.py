@@ -42,7 +42,11 @@ class ObservationReader:
             rows = [at_path(value, path) for value in observations]
             if not is_plain:
                 check_decoded_size(name, rows, leaf)
-                rows = [_decode_leaf(name, row, leaf) for row in rows]
+                for place, row in enumerate(rows):
+                    if is_encoded(row):
+                        rows[place] = decode(name, row, leaf)
+                    else:
+                        reject_strings(row)
             arrays[name] = check(name, _array(name, rows, leaf), leaf)
         if self.is_masked:
             check_mask(arrays[ACTION_MASK])
@@ -108,14 +112,6 @@ def _objects(leaf_paths: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], Key
         for depth, key in enumerate(path):
             objects.setdefault(path[:depth], {})[key] = None
     return {path: keys.keys() for path, keys in objects.items()}
-
-
-def _decode_leaf(name: str, value: Any, leaf: Leaf) -> Any:
-    """An array if the leaf is base64, otherwise the value itself, checked to contain no strings."""
-    if is_encoded(value):
-        return decode(name, value, leaf)
-    reject_strings(value)
-    return value
 
 
 def _array(name: str, rows: Any, leaf: Leaf) -> NDArray:

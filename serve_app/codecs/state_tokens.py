@@ -44,10 +44,14 @@ class StateToken(NamedTuple):
 
 def write_tokens(model: str, version: int, sha256: str, state: dict[str, NDArray]) -> list[str]:
     """Encode each row of a state (k, …)."""
-    head = _pack_head(model, version, bytes.fromhex(sha256)[:16])
+    name = model.encode("ascii")
+    head = HEAD.pack(FORMAT, version, bytes.fromhex(sha256)[:16], len(name)) + name
     columns = [array.astype(array.dtype.newbyteorder("<"), copy=False) for _, array in sorted(state.items())]
-    rows = len(columns[0])
-    return [_encode(head + b"".join(column[row].tobytes() for column in columns)) for row in range(rows)]
+    tokens = []
+    for row in range(len(columns[0])):
+        data = head + b"".join(column[row].tobytes() for column in columns)
+        tokens.append(urlsafe_b64encode(data + _digest(data)).rstrip(b"=").decode("ascii"))
+    return tokens
 
 
 def read_token(text: Any) -> StateToken:
@@ -104,15 +108,6 @@ def read_state(
         state[name] = array.astype(leaf.dtype, copy=False)
         at += _size(leaf)
     return state
-
-
-def _pack_head(model: str, version: int, manifest: bytes) -> bytes:
-    name = model.encode("ascii")
-    return HEAD.pack(FORMAT, version, manifest, len(name)) + name
-
-
-def _encode(data: bytes) -> str:
-    return urlsafe_b64encode(data + _digest(data)).rstrip(b"=").decode("ascii")
 
 
 def _digest(data: bytes) -> bytes:

@@ -51,8 +51,12 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
         both = "both observation and observations" if is_batch else "neither observation nor observations"
         raise InvalidInput(f"the body has {both}, expected one of them")
     observations = document["observations"] if is_batch else [document["observation"]]
-    if is_batch:
-        _check_batch(observations, max_batch)
+    if type(observations) is not list:
+        raise InvalidInput(f"observations is {json_type(observations)}, expected a list of observations")
+    if not observations:
+        raise InvalidInput("observations is empty, expected at least one")
+    if len(observations) > max_batch:
+        raise BodyTooLarge(f"observations has {len(observations)} items, expected at most {max_batch}")
     explore = parse_flag(document, "explore") if "explore" in document else None
     probabilities = parse_flag(document, "probabilities")
     seed = document.get("seed")
@@ -124,15 +128,6 @@ def _check_seed(seed: Any, batch: int | None) -> None:
     seeds = seed if batch is not None and type(seed) is list else [seed]
     if any(type(row_seed) is not int or not 0 <= row_seed < 2**63 for row_seed in seeds):
         raise InvalidInput("seed must be null or an integer from 0 to 2^63 - 1, or in a batch a list of such integers")
-
-
-def _check_batch(observations: Any, max_batch: int) -> None:
-    if type(observations) is not list:
-        raise InvalidInput(f"observations is {json_type(observations)}, expected a list of observations")
-    if not observations:
-        raise InvalidInput("observations is empty, expected at least one")
-    if len(observations) > max_batch:
-        raise BodyTooLarge(f"observations has {len(observations)} items, expected at most {max_batch}")
 
 
 Arrays = dict[str, NDArray]

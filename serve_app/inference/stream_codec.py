@@ -57,7 +57,10 @@ class BinaryCodec:
     """Decodes requests and encodes responses of one policy."""
 
     def __init__(self, policy: LoadedPolicy) -> None:
-        self._inputs = [_input(name, leaf) for name, _, leaf in policy.reader.leaves]
+        self._inputs = [
+            _Input(name, leaf, _little(leaf.dtype), np.dtype(leaf.dtype).itemsize * prod(leaf.shape))
+            for name, _, leaf in policy.reader.leaves
+        ]
         self._row = sum(tensor.size for tensor in self._inputs)
         self._is_masked = policy.reader.is_masked
         self._action = _little(next(tensor.dtype for tensor in policy.manifest.outputs if tensor.name == ACTION))
@@ -122,11 +125,6 @@ def _array(data: memoryview, each: _Input, rows: int) -> NDArray:
     if not array.flags.aligned:  # kernels of the graph require alignment
         array = array.copy()
     return check(each.name, array.reshape(rows, *each.leaf.shape), each.leaf)
-
-
-def _input(name: str, leaf: Leaf) -> _Input:
-    dtype = _little(leaf.dtype)
-    return _Input(name, leaf, dtype, dtype.itemsize * prod(leaf.shape))
 
 
 def _little(dtype: str) -> np.dtype:

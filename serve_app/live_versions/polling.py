@@ -68,9 +68,17 @@ class Polling:
             try:
                 await self._poll()
             except Exception as error:
-                self._back_off(error)
+                # Only a bug raises anything but a LeagueError; it must not stop polling.
+                bug = None if isinstance(error, LeagueError) else error
+                if str(error) != self._fault:
+                    logger.error("cannot poll %s, keeping the last known state: %s", self._subject, error, exc_info=bug)
+                self._fault = str(error)
+                self._pause = min(2 * self._pause, self._settings.poll_slowest)
             else:
-                self._recover()
+                if self._fault is not None:
+                    logger.error("polling %s again", self._subject)
+                self._fault = None
+                self._pause = self._settings.poll
             finally:
                 overdue.cancel()
             await self._wait(self._pause * self._random.uniform(1 - JITTER, 1 + JITTER))
@@ -79,17 +87,3 @@ class Polling:
         """Log that a poll does not return: until the database answers or a timeout ends it, nothing is followed."""
         self._fault = f"a poll has not returned for {OVERDUE:g} s"
         logger.error("cannot poll %s, keeping the last known state: %s", self._subject, self._fault)
-
-    def _back_off(self, error: Exception) -> None:
-        """Increase the pause. Only a bug raises anything but a LeagueError; it must not stop polling."""
-        bug = None if isinstance(error, LeagueError) else error
-        if str(error) != self._fault:
-            logger.error("cannot poll %s, keeping the last known state: %s", self._subject, error, exc_info=bug)
-        self._fault = str(error)
-        self._pause = min(2 * self._pause, self._settings.poll_slowest)
-
-    def _recover(self) -> None:
-        if self._fault is not None:
-            logger.error("polling %s again", self._subject)
-        self._fault = None
-        self._pause = self._settings.poll

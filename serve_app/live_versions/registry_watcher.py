@@ -134,7 +134,11 @@ class RegistryWatcher:
         self._is_current = False
         if time.monotonic() >= self._heartbeat_at:
             # Before the aliases are read for the first time: nobody waits for a replica that is not registered.
-            await self._register()
+            is_known, replicas = await self._connection.call(self._report_life)
+            if not is_known:
+                self._acknowledged = _Acknowledged()
+            self._on_replicas(replicas)
+            self._heartbeat_at = time.monotonic() + self._settings.heartbeat
         loaded = self._slots.loaded()
         read = await self._connection.call(lambda registry: self._read(registry, loaded))
         self._accept(read)
@@ -159,16 +163,11 @@ class RegistryWatcher:
         else:
             await asyncio.sleep(random.uniform(0, SPREAD))
 
-    async def _register(self) -> None:
-        """Register this replica, and remove those that ended without deregistering."""
-        is_known, replicas = await self._connection.call(self._report_life)
-        if not is_known:
-            self._acknowledged = _Acknowledged()
-        self._on_replicas(replicas)
-        self._heartbeat_at = time.monotonic() + self._settings.heartbeat
-
     def _report_life(self, registry: Registry) -> tuple[bool, int]:
-        """Whether this replica was registered, and the number of replicas that are not being stopped."""
+        """Register this replica, and remove those that ended without deregistering.
+
+        Returns whether this one was registered, and the number of replicas that are not being stopped.
+        """
         is_known = registry.replicas.register(self._replica, self._process.description, self._is_draining())
         overdue = OVERDUE_HEARTBEATS * timedelta(seconds=self._settings.heartbeat)
         replicas = registry.replicas.counts(overdue)
@@ -206,7 +205,10 @@ class RegistryWatcher:
             self._update_keys(read.keys)
         if read.aliases is not None:
             self._aliases = read.aliases
-            self._newest_events = _newest_events(read.aliases)
+            newest_events: dict[str, int] = {}
+            for (league, _), target in read.aliases.items():
+                newest_events[league] = max(target.event, newest_events.get(league, 0))
+            self._newest_events = newest_events
         if read.traffic is not None:
             self._wanted_traffic = read.traffic
         if read.selections is not None:
@@ -235,26 +237,15 @@ class RegistryWatcher:
 
     def _differing(self) -> dict[str, ServedState]:
         """league → what is served, where this differs from what was read."""
-        leagues = self._slots.differing() | self._traffic.differing()
-        if not leagues:
-            return {}
-        numbers, faults = self._slots.numbers(), self._slots.faults()
-        return {league: self._serves(league, numbers.get(league, {}), faults.get(league)) for league in leagues}
-
-    def _serves(self, league: str, numbers: Mapping[str, int], fault: str | None) -> ServedState:
-        champion = self._slots.champion(league)
-        return ServedState(
-            version=champion.number if champion else None,
-            sha256=champion.sha256 if champion else None,
-            fault=fault,
-            aliases=numbers,
-            event=self._newest_events.get(league),
-            traffic=self._traffic.applied_setting(league),
-        )
-
-
-def _newest_events(aliases: Mapping[Alias, AliasTarget]) -> dict[str, int]:
-    newest: dict[str, int] = {}
-    for (league, _), target in aliases.items():
-        newest[league] = max(target.event, newest.get(league, 0))
-    return newest
+        numbers, faults, states = self._slots.numbers(), self._slots.faults(), {}
+        for league in self._slots.differing() | self._traffic.differing():
+            champion = self._slots.champion(league)
+            states[league] = ServedState(
+                version=champion.number if champion else None,
+                sha256=champion.sha256 if champion else None,
+                fault=faults.get(league),
+                aliases=numbers.get(league, {}),
+                event=self._newest_events.get(league),
+                traffic=self._traffic.applied_setting(league),
+            )
+        return states

@@ -116,7 +116,20 @@ class Shadow:
         policy = policy_ref(model).policy
 
         def mirror(observations: Arrays, state: Arrays | None, actions: NDArray | None) -> None:
-            self._enqueue(MirroredRequest(candidate, version, policy, observations, actions), is_first=state is None)
+            request = MirroredRequest(candidate, version, policy, observations, actions)
+            counts = self._counts_of(_pair(request))
+            if state is not None:  # it would be another network's
+                counts.skipped += 1
+                return
+            size = sum(array.nbytes for array in observations.values())
+            if len(self._waiting) >= self._settings.shadow_waiting or self._bytes + size > MAX_WAITING_BYTES:
+                counts.dropped += 1
+                return
+            self._waiting.append(request)
+            self._bytes += size
+            if not self._is_scheduled:
+                self._is_scheduled = True
+                asyncio.get_running_loop().call_later(BATCH_WINDOW, self._start_batch)
 
         return mirror
 
@@ -140,22 +153,6 @@ class Shadow:
     def close(self) -> None:
         """Stop the thread."""
         self._thread.shutdown(wait=False, cancel_futures=True)
-
-    def _enqueue(self, request: MirroredRequest, is_first: bool) -> None:
-        """Queue a request. is_first: whether it has no recurrent state, which would be another network's."""
-        counts = self._counts_of(_pair(request))
-        if not is_first:
-            counts.skipped += 1
-            return
-        size = sum(array.nbytes for array in request.observations.values())
-        if len(self._waiting) >= self._settings.shadow_waiting or self._bytes + size > MAX_WAITING_BYTES:
-            counts.dropped += 1
-            return
-        self._waiting.append(request)
-        self._bytes += size
-        if not self._is_scheduled:
-            self._is_scheduled = True
-            asyncio.get_running_loop().call_later(BATCH_WINDOW, self._start_batch)
 
     def _start_batch(self) -> None:
         requests, self._waiting, self._bytes = self._waiting, [], 0
@@ -239,12 +236,19 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
     outcome = ShadowResult(_pair(requests[0]))
     try:
         candidate = requests[0].candidate.policy(requests[0].policy)
-        observations = _concatenate([request.observations for request in requests])
+        names = requests[0].observations
+        observations = {name: np.concatenate([request.observations[name] for request in requests]) for name in names}
         seeds = np.random.default_rng().integers(2**63, size=sum(map(_rows, requests)))
         start = thread_time_ns()
         actions = _act(candidate, candidate.shadow_policy, observations, seeds)
         cpu_ns = thread_time_ns() - start
-        expected = _champion_actions(requests, requests[0].champion.policy(requests[0].policy), observations, seeds)
+        champion = requests[0].champion.policy(requests[0].policy)
+        recorded = [request.actions for request in requests if request.actions is not None]
+        # The champion's actions are recomputed if they were or are to be sampled.
+        if champion.samples or len(recorded) < len(requests):
+            expected = _act(champion, champion.policy, observations, seeds)
+        else:
+            expected = np.concatenate(recorded)
         outcome.agreed = int(same(actions, expected, candidate.manifest.action, TOLERANCE).sum())
     except Exception as error:  # any failure is counted against the candidate
         outcome.is_late = isinstance(error, GraphTimeout)
@@ -260,22 +264,6 @@ def _act(policy: LoadedPolicy, graph: OnnxPolicy, observations: Arrays, seeds: N
     if not policy.samples:
         return graph.act(observations).actions
     return graph.act(observations, explore=True, rng=generators(seeds)).actions
-
-
-def _champion_actions(
-    requests: Sequence[MirroredRequest], champion: LoadedPolicy, observations: Arrays, seeds: NDArray[np.int64]
-) -> NDArray:
-    """The champion's actions, recomputed if they were or are to be sampled."""
-    recorded_actions = [request.actions for request in requests if request.actions is not None]
-    if champion.samples or len(recorded_actions) < len(requests):
-        return _act(champion, champion.policy, observations, seeds)
-    return np.concatenate(recorded_actions)
-
-
-def _concatenate(batches: Sequence[Arrays]) -> Arrays:
-    if len(batches) == 1:
-        return batches[0]
-    return {name: np.concatenate([batch[name] for batch in batches]) for name in batches[0]}
 
 
 def _rows(request: MirroredRequest) -> int:
