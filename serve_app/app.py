@@ -42,14 +42,13 @@ from serve_app.inference_protocol.grpc_service import InferenceService
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.rest import InferRoute, RestRoutes
 from serve_app.inference_protocol.statistics import REPORT
-from serve_app.live_versions.action_selections import ActionSelections
 from serve_app.live_versions.alias_slots import AliasSlots
 from serve_app.live_versions.registry_connection import RegistryConnection
 from serve_app.live_versions.registry_watcher import RegistryWatcher
 from serve_app.live_versions.resolver import ModelResolver
 from serve_app.live_versions.shadow import Shadow
 from serve_app.live_versions.traffic_split import TrafficSplit
-from serve_app.live_versions.version_cache import VersionCache, load
+from serve_app.live_versions.version_cache import ActionSelections, VersionCache, load
 from serve_app.observability.load import LoadSampler
 from serve_app.observability.metrics import Metrics, Report
 from serve_app.observability.metrics_reporter import MetricsReporter
@@ -80,23 +79,19 @@ would delay the slowest requests by as much."""
 
 
 def build_app(args: ServeSettings) -> Application:
-    """The Serve application. `args` in deploy.yaml are fields of ServeSettings."""
-    deployment = serve.deployment(serve.ingress()(PolicyServer))
-    return deployment.bind(args, _evaluation_service(args), installed_with_this())
-
-
-def _evaluation_service(args: ServeSettings) -> Application | None:
-    """The evaluation service, imported by name so that serve_app does not depend on it. Raises ConfigError."""
-    if args.evaluation_service is None:
-        return None
-    module, _, name = args.evaluation_service.partition(":")
-    try:
-        bound: Application = getattr(import_module(module), name)(args.evaluation_workers, args.evaluations_at_once)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(
-            f"deploy.yaml: args: evaluation_service {args.evaluation_service!r} cannot be imported: {error}"
-        ) from error
-    return bound
+    """The Serve application. `args` in deploy.yaml are fields of ServeSettings. Raises ConfigError."""
+    evaluation_service: Application | None = None
+    if args.evaluation_service is not None:
+        # It is imported by name so that serve_app does not depend on it.
+        module, _, name = args.evaluation_service.partition(":")
+        try:
+            bind = getattr(import_module(module), name)
+            evaluation_service = bind(args.evaluation_workers, args.evaluations_at_once)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ConfigError(
+                f"deploy.yaml: args: evaluation_service {args.evaluation_service!r} cannot be imported: {error}"
+            ) from error
+    return serve.deployment(serve.ingress()(PolicyServer)).bind(args, evaluation_service, installed_with_this())
 
 
 class PolicyServer(ray_serve.AsgiReplica):
@@ -190,7 +185,9 @@ class Replica:
         )
         self.alias_slots = AliasSlots(self.versions)
         self.traffic = TrafficSplit(self.alias_slots)
-        self.access_log = _access_log(registry, settings, replica)
+        self.access_log = (
+            None if settings.access_log is None else AccessLog(registry.storage.home / settings.access_log, replica)
+        )
         self.shadow = Shadow(self.alias_slots, self.traffic, settings)
         self.metrics = Metrics(self.alias_slots, self.traffic, self.shadow)
         self.errors = ErrorHandlers(settings.retry, self.metrics.count_error)
@@ -306,9 +303,3 @@ def _redirect_slashes(router: Router) -> None:
 
     router.redirect_slashes = False
     router.default = default
-
-
-def _access_log(registry: Registry, settings: ServeSettings, replica: str) -> AccessLog | None:
-    if settings.access_log is None:
-        return None
-    return AccessLog(registry.storage.home / settings.access_log, replica)

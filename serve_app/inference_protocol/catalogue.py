@@ -84,7 +84,13 @@ class ModelCatalogue:
 
         Raises the errors of `ModelResolver.find`.
         """
-        documents = sum_documents(await self._of_all_replicas())
+        try:
+            await self._report()  # first, so that no later answer, by any replica, has less
+            reports = await self._models.in_registry_thread(lambda registry: registry.replicas.reports())
+            documents = [document for report in reports.values() for document in report.get(REPORT, ())]
+        except StorageError:
+            documents = self._inference.statistics.documents()
+        documents = sum_documents(documents)
         if not model:
             return {"model_stats": documents}
         served = await self._inference.find(model, version)
@@ -95,15 +101,6 @@ class ModelCatalogue:
         if all(document["version"] != str(number) for document in model_documents):
             model_documents.append(ModelStatistics().document(served.name, number))
         return {"model_stats": model_documents}
-
-    async def _of_all_replicas(self) -> list[Document]:
-        """What the replicas wrote last. This one writes first, so that no later answer, by any replica, has less."""
-        try:
-            await self._report()
-            reports = await self._models.in_registry_thread(lambda registry: registry.replicas.reports())
-        except StorageError:
-            return self._inference.statistics.documents()
-        return [document for report in reports.values() for document in report.get(REPORT, ())]
 
     async def index(self, only_ready: bool = False) -> list[Document]:
         """All versions of all policies. Versions in memory are ready; others are loaded on demand. Raises

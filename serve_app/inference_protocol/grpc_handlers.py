@@ -7,6 +7,7 @@
 its service answers, bypassing Ray Serve's request path. In Ray Serve's fallback proxy, calls fail with UNAVAILABLE.
 """
 
+from operator import methodcaller
 from typing import Any, Protocol
 
 import grpc
@@ -81,8 +82,4 @@ def _handler(rpc: str, request_type: type[Message]) -> grpc.RpcMethodHandler:
         context.set_details(message[:MAX_MESSAGE_LENGTH])
         return None  # no response is sent with an error
 
-    return grpc.stream_unary_rpc_method_handler(answer, response_serializer=_serialize)
-
-
-def _serialize(message: Message) -> bytes:
-    return message.SerializeToString()
+    return grpc.stream_unary_rpc_method_handler(answer, response_serializer=methodcaller("SerializeToString"))

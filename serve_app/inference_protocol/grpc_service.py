@@ -1,6 +1,6 @@
 """The Open Inference Protocol over gRPC: messages to requests and back, and the service that answers them."""
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from functools import lru_cache
 from ipaddress import IPv6Address, ip_address
 from typing import Any
@@ -23,7 +23,6 @@ from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
 from serve_app.inference_protocol.statistics import Document
 from serve_app.inference_protocol.tensors import Data, RequestTensor, Signature, datatype_of, to_bytes
 from serve_app.live_versions.registry_watcher import RegistryWatcher
-from serve_app.live_versions.traffic_split import Headers
 from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
 from serve_app.settings import ServeSettings
 
@@ -149,16 +148,6 @@ class InferenceService:
         self._settings = settings
         self._machine = machine
         self._count = count
-        self.rpcs: dict[str, Callable[[Any], Awaitable[Message]]] = {
-            "ServerLive": self._server_live,
-            "ServerReady": self._server_ready,
-            "ModelReady": self._model_ready,
-            "ServerMetadata": self._server_metadata,
-            "ModelMetadata": self._model_metadata,
-            "ModelConfig": self._model_config,
-            "ModelStatistics": self._model_statistics,
-            "RepositoryIndex": self._repository_index,
-        }
 
     async def call(self, rpc: str, request_type: type[Message], context: grpc.aio.ServicerContext) -> Message:
         """Answer a call. Raises LeagueError.
@@ -171,7 +160,7 @@ class InferenceService:
         try:
             key = self._access.admit_rpc(metadata, rpc)
             if rpc in EMPTY:
-                return await self.rpcs[rpc](request_type())
+                return await self._answer(rpc, request_type())
             with self._inference.admitted():
                 body = await self._read(context, self._settings.max_body if rpc == INFER else MAX_CHANGE_BODY)
                 if len(body) > LARGE_BODY:
@@ -179,9 +168,13 @@ class InferenceService:
                 request: Any = parse(body, request_type)
                 model = request.model_name if rpc == INFER else getattr(request, "name", "")
                 self._access.check_model(key, rpc, model)
-                if rpc == INFER:
-                    return await self._model_infer(request, len(body), headers_of(metadata))
-                return await self.rpcs[rpc](request)
+                if rpc != INFER:
+                    return await self._answer(rpc, request)
+                headers = headers_of(metadata)
+                if max(len(request.inputs), len(request.outputs), len(request.raw_input_contents)) > FEW_TENSORS:
+                    served = await self._inference.find(model, request.model_version, headers)
+                    check_counts(request, served.signature)
+                return await self._inference.infer(read_request(request, len(body)), write_response, headers)
         except LeagueError as error:
             self._count(f"/v2/models/{model}", error.code)
             raise
@@ -198,43 +191,32 @@ class InferenceService:
             raise BodyTooLarge(f"the message is larger than {limit} bytes")
         return body
 
-    async def _server_live(self, _: Message) -> Message:
-        return messages.ServerLiveResponse(live=True)
-
-    async def _server_ready(self, _: Message) -> Message:
-        return messages.ServerReadyResponse(ready=self._watcher.is_ready)
-
-    async def _model_ready(self, request: messages.ModelReadyRequest) -> Message:
-        try:
-            await self._inference.find(request.name, request.version)
-        except (NotFound, NotReady, ArtifactCorrupt, StorageError):
-            return messages.ModelReadyResponse(ready=False)
-        return messages.ModelReadyResponse(ready=True)
-
-    async def _server_metadata(self, _: Message) -> Message:
-        return _message(self._catalogue.server(), messages.ServerMetadataResponse())
-
-    async def _model_metadata(self, request: messages.ModelMetadataRequest) -> Message:
-        metadata = await self._catalogue.metadata(request.name, request.version)
-        return _message(metadata, messages.ModelMetadataResponse())
-
-    async def _model_config(self, request: messages.ModelConfigRequest) -> Message:
-        config = await self._catalogue.config(request.name, request.version)
-        return _message({"config": config}, messages.ModelConfigResponse())
-
-    async def _model_statistics(self, request: messages.ModelStatisticsRequest) -> Message:
-        statistics = await self._catalogue.statistics(request.name, request.version)
-        return _message(statistics, messages.ModelStatisticsResponse())
-
-    async def _repository_index(self, request: messages.RepositoryIndexRequest) -> Message:
-        models = await self._catalogue.index(request.ready)
-        return _message({"models": models}, messages.RepositoryIndexResponse())
-
-    async def _model_infer(self, request: messages.ModelInferRequest, size: int, headers: Headers) -> Message:
-        if max(len(request.inputs), len(request.outputs), len(request.raw_input_contents)) > FEW_TENSORS:
-            served = await self._inference.find(request.model_name, request.model_version, headers)
-            check_counts(request, served.signature)
-        return await self._inference.infer(read_request(request, size), write_response, headers)
+    async def _answer(self, rpc: str, request: Any) -> Message:
+        """Answer a call that is not ModelInfer."""
+        catalogue = self._catalogue
+        match rpc:
+            case "ServerLive":
+                document: Document = {"live": True}
+            case "ServerReady":
+                document = {"ready": self._watcher.is_ready}
+            case "ModelReady":
+                document = {"ready": True}
+                try:
+                    await self._inference.find(request.name, request.version)
+                except (NotFound, NotReady, ArtifactCorrupt, StorageError):
+                    document = {"ready": False}
+            case "ServerMetadata":
+                document = catalogue.server()
+            case "ModelMetadata":
+                document = await catalogue.metadata(request.name, request.version)
+            case "ModelConfig":
+                document = {"config": await catalogue.config(request.name, request.version)}
+            case "ModelStatistics":
+                document = await catalogue.statistics(request.name, request.version)
+            case "RepositoryIndex":
+                document = {"models": await catalogue.index(request.ready)}
+        response: Message = getattr(messages, f"{rpc}Response")()
+        return ParseDict(document, response)
 
 
 def parse(body: bytes, request_type: type[Message]) -> Message:
@@ -244,7 +226,3 @@ def parse(body: bytes, request_type: type[Message]) -> Message:
         return request_type.FromString(body)
     except DecodeError:
         raise malformed(request_type.DESCRIPTOR) from None
-
-
-def _message(document: Document, empty: Message) -> Message:
-    return ParseDict(document, empty)

@@ -25,28 +25,19 @@ LEVEL = 1
 """The fastest level."""
 MIN_COMPRESSED_BYTES = 1024
 """Smaller responses are not compressed."""
+ENCODINGS = (b"gzip", b"deflate")
 
 
 async def compressed(body: bytes, accepted: bytes) -> tuple[bytes, bytes | None]:
     """Compress a body as Accept-Encoding permits; returns it with its Content-Encoding."""
-    encoding = _choose_encoding(accepted) if len(body) >= MIN_COMPRESSED_BYTES else None
-    if encoding is None:
+    if len(body) < MIN_COMPRESSED_BYTES:
         return body, None
-    return await asyncio.to_thread(_deflate, body, WINDOW_BITS[encoding]), encoding
-
-
-def _choose_encoding(accepted: bytes) -> bytes | None:
-    """The first accepted encoding that is supported. Weights are ignored, except `q=0`."""
+    # The first encoding that is supported. Weights are ignored, except `q=0`.
     for item in accepted.lower().split(b","):
         name, _, quality = item.partition(b";")
-        if name.strip() in (b"gzip", b"deflate") and quality.replace(b" ", b"").strip(b"0.") != b"q=":
-            return name.strip()
-    return None
-
-
-def _deflate(body: bytes, window_bits: int) -> bytes:
-    deflater = zlib.compressobj(LEVEL, wbits=window_bits)
-    return deflater.compress(body) + deflater.flush()
+        if (encoding := name.strip()) in ENCODINGS and quality.replace(b" ", b"").strip(b"0.") != b"q=":
+            return await asyncio.to_thread(zlib.compress, body, LEVEL, WINDOW_BITS[encoding]), encoding
+    return body, None
 
 
 SIZE = "binary_data_size"
@@ -69,7 +60,10 @@ def read_request(model: str, version: str, body: bytes, header_length: int | Non
 
     Raises MalformedBody or InvalidInput.
     """
-    document, tensor_bytes = _split(body, header_length)
+    if header_length is not None and header_length > len(body):
+        raise MalformedBody(f"Inference-Header-Content-Length is {header_length}, but the body has {len(body)} bytes")
+    document = parse_json_object(body[:header_length])
+    tensor_bytes = memoryview(b"" if header_length is None else body)[header_length or 0 :]
     parameters = _parameters(document, "the request")
     outputs = _list(document, "outputs", required=False)
     names, binary = [], {}
@@ -108,14 +102,6 @@ def write_response(response: InferResponse, request: RestRequest) -> tuple[bytes
         document["id"] = response.id
     head = orjson.dumps(document | {"outputs": outputs}, option=DUMP)
     return (b"".join((head, *parts)), len(head)) if parts else (head, None)
-
-
-def _split(body: bytes, header_length: int | None) -> tuple[dict[str, Any], memoryview]:
-    if header_length is None:
-        return parse_json_object(body), memoryview(b"")
-    if header_length > len(body):
-        raise MalformedBody(f"Inference-Header-Content-Length is {header_length}, but the body has {len(body)} bytes")
-    return parse_json_object(body[:header_length]), memoryview(body)[header_length:]
 
 
 def _tensors(inputs: list[Any], rest: memoryview) -> list[RequestTensor]:

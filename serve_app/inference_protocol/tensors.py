@@ -121,14 +121,7 @@ def read_inputs(tensors: Sequence[RequestTensor], signature: Signature, max_batc
         if tensor.name in arrays:
             raise ObservationError(f"input {tensor.name} is given twice")
         arrays[tensor.name] = _array(tensor, port, max_batch)
-    _check_whole(arrays, signature)
-    if signature.is_masked:
-        check_mask(arrays[ACTION_MASK])
-    return arrays
-
-
-def _check_whole(arrays: dict[str, NDArray], signature: Signature) -> None:
-    """Raise ObservationError unless all inputs, or all but the state, are present with the same number of rows."""
+    # All inputs, or all but the state, must be there.
     if len(arrays) < len(signature.inputs):
         has_state = any(port.is_state and name in arrays for name, port in signature.inputs.items())
         for name, port in signature.inputs.items():
@@ -138,6 +131,9 @@ def _check_whole(arrays: dict[str, NDArray], signature: Signature) -> None:
     if len(rows) > 1:
         sizes = ", ".join(f"{name} has {len(array)}" for name, array in arrays.items())
         raise ObservationError(f"the inputs have different numbers of rows: {sizes}")
+    if signature.is_masked:
+        check_mask(arrays[ACTION_MASK])
+    return arrays
 
 
 def _array(tensor: RequestTensor, port: TensorSpec, max_batch: int) -> NDArray:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from league.conditions import ActionSelection
 from league.errors import (
     ArtifactCorrupt,
     DeadlineExceeded,
@@ -28,7 +29,6 @@ from league.registry.storage.rows import VersionState
 from league.spaces import Box, Leaf
 from serve_app.codecs.observation_codec import ObservationReader
 from serve_app.codecs.request_limits import RequestLimits
-from serve_app.live_versions.action_selections import ActionSelections
 from serve_app.live_versions.daemon_thread import in_daemon_thread
 
 SHADOW_TIMEOUT = 1.0
@@ -40,6 +40,10 @@ RUNS_IN_THREADS = min(32, (os.cpu_count() or 1) + 4) // 2
 leaves the others to the rest of the replica."""
 WARM_BATCH = 64
 """Large enough to measure the time per row, small enough to run in milliseconds."""
+
+ActionSelections = dict[str, ActionSelection]
+"""league → how its versions select actions if a request does not say. All of them share it, so that a change reaches
+all at once."""
 
 
 @dataclass(slots=True, eq=False, weakref_slot=True)
@@ -80,7 +84,7 @@ class LoadedPolicy:
     @property
     def samples(self) -> bool:
         """Whether actions are sampled if a request does not say, as in the league's matches."""
-        return self.policy.has_distribution and self.selections.is_sampled(self.league)
+        return self.policy.has_distribution and self.selections[self.league] == "sampled"
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +138,7 @@ def load(
     registry.artifacts.verify_names(league, number, version.sha256)
     if version.mixture is not None:
         return LoadedVersion(league, number, version.sha256, {}, version.mixture)
-    selections.add(league, registry.leagues.get(league).conditions.actions)
+    selections.setdefault(league, registry.leagues.get(league).conditions.actions)
     policies = {}
     for name, manifest in version.manifest.policies.items():
         # Each file is verified as it is read. The others, such as the state of training, can be large.

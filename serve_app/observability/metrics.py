@@ -7,6 +7,7 @@ for Prometheus.
 
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 from time import monotonic, time
 from typing import Any
 
@@ -24,6 +25,8 @@ BATCH_SIZES = tuple(2**power for power in range(11))
 """Upper bounds of the batch-size buckets; a last bucket holds larger batches."""
 REJECTIONS = ("unauthenticated", "forbidden", "rate_limited")
 """Error codes of requests that access control refused."""
+MEMORY, PAGE_SIZE = Path("/proc/self/statm"), 4096
+"""The second number of the file is that of resident pages."""
 
 Label = tuple[str, str, str, str]
 """league, policy, version, api"""
@@ -138,7 +141,7 @@ class Metrics:
             "league_swaps_total": [[[league], self._slots.swaps[league]] for league in leagues],
             "league_requests_in_flight": [[[api], count] for api, count in self.in_flight.items()],
             "league_replica_start_time_seconds": [[[], self._started_at]],
-            "league_replica_resident_bytes": [[[], _resident_bytes()]],
+            "league_replica_resident_bytes": [[[], PAGE_SIZE * int(MEMORY.read_text("ascii").split()[1])]],
         }
 
     def _mirrored(self) -> Report:
@@ -162,9 +165,3 @@ class Metrics:
             "league_canary_share": [[[league], target.share] for league, target in traffic.canaries.items()],
             "league_shadow_share": [[[league], target.share] for league, target in traffic.shadows.items()],
         }
-
-
-def _resident_bytes() -> int:
-    with open("/proc/self/statm", encoding="ascii") as file:
-        pages = int(file.read().split()[1])
-    return pages * 4096

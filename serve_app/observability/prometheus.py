@@ -1,7 +1,8 @@
 """Renders the reports of all replicas in the Prometheus text format."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any, Literal
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -93,6 +94,13 @@ METRICS = {
 """Name in reports → definition."""
 
 
+FAMILIES: dict[str, Any] = {
+    "counter": CounterMetricFamily,
+    "gauge": GaugeMetricFamily,
+    "histogram": HistogramMetricFamily,
+}
+
+
 def render(reports: Mapping[str, Report]) -> bytes:
     """Render replica → report in the Prometheus text format. Unknown metrics are ignored."""
     registry = CollectorRegistry()
@@ -106,32 +114,13 @@ class _ReportCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         for name, definition in METRICS.items():
-            samples = [
-                ([*labels, replica], value)
-                for replica, report in self._reports.items()
-                for labels, value in report.get(name, ())
-            ]
-            yield _family(name, definition, samples)
-
-
-def _family(name: str, definition: MetricDefinition, samples: Iterable[tuple[list[str], Any]]) -> Metric:
-    labels = (*definition.labels, "replica")
-    if definition.kind == "histogram":
-        histogram = HistogramMetricFamily(name, definition.help, labels=labels)
-        for values, value in samples:
-            histogram.add_metric(values, _buckets(definition.bounds, value["counts"]), value["sum"])
-        return histogram
-    kind = CounterMetricFamily if definition.kind == "counter" else GaugeMetricFamily
-    family = kind(name, definition.help, labels=labels)
-    for values, value in samples:
-        family.add_metric(values, value)
-    return family
-
-
-def _buckets(bounds: tuple[float, ...], counts: list[int]) -> list[tuple[str, float]]:
-    """Upper bound → cumulative count."""
-    total, buckets = 0, []
-    for bound, count in zip((*map(str, bounds), "+Inf"), counts, strict=True):
-        total += count
-        buckets.append((bound, float(total)))
-    return buckets
+            family = FAMILIES[definition.kind](name, definition.help, labels=(*definition.labels, "replica"))
+            bounds = (*map(str, definition.bounds), "+Inf")
+            for replica, report in self._reports.items():
+                for labels, value in report.get(name, ()):
+                    if definition.kind == "histogram":
+                        cumulative = map(float, accumulate(value["counts"]))
+                        family.add_metric([*labels, replica], list(zip(bounds, cumulative, strict=True)), value["sum"])
+                    else:
+                        family.add_metric([*labels, replica], value)
+            yield family

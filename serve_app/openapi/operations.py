@@ -207,22 +207,18 @@ def _errors(route: Declaration) -> Document:
     if route.path_names:
         meanings.setdefault(404, {})[CODES[404]] = UNLISTED[404]
     is_open_inference = route.path.startswith(OPEN_INFERENCE)
-    return {
-        "-".join((str(status), *meanings[status], *(["v2"] if is_open_inference else ()))): _error(
-            status, meanings[status], is_open_inference
-        )
-        for status in sorted(meanings)
-    }
-
-
-def _error(status: int, meanings: Mapping[str, str], is_open_inference: bool) -> Document:
-    if is_open_inference:
-        schema: Document = {"$ref": f"{SCHEMAS}OpenInferenceError"}
-    else:
-        codes = {"properties": {"code": {"enum": list(meanings)}}}
-        schema = {"allOf": [{"$ref": f"{SCHEMAS}Error"}, codes]}
-    headers = {"headers": HEADERS[status]} if status in HEADERS else {}
-    return {"description": " ".join(meanings.values())} | headers | {"content": {JSON[0]: {"schema": schema}}}
+    responses: Document = {}
+    for status in sorted(meanings):
+        codes = list(meanings[status])
+        name = "-".join((str(status), *codes, *(["v2"] if is_open_inference else ())))
+        if is_open_inference:
+            schema: Document = {"$ref": f"{SCHEMAS}OpenInferenceError"}
+        else:
+            schema = {"allOf": [{"$ref": f"{SCHEMAS}Error"}, {"properties": {"code": {"enum": codes}}}]}
+        headers = {"headers": HEADERS[status]} if status in HEADERS else {}
+        description = " ".join(meanings[status].values())
+        responses[name] = {"description": description} | headers | {"content": {JSON[0]: {"schema": schema}}}
+    return responses
 
 
 def _possible(route: Declaration) -> Iterator[type[LeagueError]]:

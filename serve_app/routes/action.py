@@ -115,7 +115,13 @@ class ActionRoute:
         model, requested = scope["path_params"]["model"], query_params(scope).get("version", CHAMPION)
         if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
             self._access.admit_body(scope.get(KEY), len(body))
-        document = await self._parse_large(body, model, requested) if is_large else parse_json_object(body)
+        if is_large:
+            with suppress(NotReady):  # without a champion, a token in the body may name the version
+                _, policy = await self._models.find(model, requested)
+                policy.limits.check_body(body, self._settings.max_batch)
+            document = await asyncio.to_thread(parse_json_object, body)
+        else:
+            document = parse_json_object(body)
         reject_unknown_keys(document, KEYS)
         request = parse_action_request(document, self._settings.max_batch)
         members = await self._models.members(model, requested) if request.tokens and any(request.tokens) else ()
@@ -125,15 +131,11 @@ class ActionRoute:
         response |= {"model": model, "version": version.number, "sha256": version.sha256}
         if LOG_ENTRY in scope:
             log_version(scope, model, version.number)
-        await _send(send, orjson.dumps(response), self._replica)
+        content = orjson.dumps(response)
+        headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(content)), self._replica]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        await send({"type": "http.response.body", "body": content})
         self._metrics.count_request(API, model, version, len(request.observations), perf_counter_ns() - start)
-
-    async def _parse_large(self, body: bytes, model: str, requested: str) -> dict[str, Any]:
-        """Parse a body in a thread, unless it is too large for the policy."""
-        with suppress(NotReady):  # without a champion, a token in the body may name the version
-            _, policy = await self._models.find(model, requested)
-            policy.limits.check_body(body, self._settings.max_batch)
-        return await asyncio.to_thread(parse_json_object, body)
 
 
 class ActionDispatch:
@@ -176,9 +178,3 @@ async def _response(
             tokens = encode_state(output, version, policy)
             response["state"] = tokens if request.is_batch else tokens[0]
     return response
-
-
-async def _send(send: Send, body: bytes, replica: tuple[bytes, bytes]) -> None:
-    headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(body)), replica]
-    await send({"type": "http.response.start", "status": 200, "headers": headers})
-    await send({"type": "http.response.body", "body": body})

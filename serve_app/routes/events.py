@@ -109,7 +109,14 @@ class EventBroker:
         if self._is_over:
             raise NotReady("this replica is shutting down: reconnect")
         with self.connections.opened(key):
-            topic = self._topics.get(name) or self._topics.setdefault(name, await self._create_topic(query))
+            topic = self._topics.get(name)
+            if topic is None:
+                try:
+                    async with asyncio.timeout(self._settings.timeout):
+                        document = await self._models.in_registry_thread(query)
+                except TimeoutError:
+                    raise DeadlineExceeded(f"the request timed out after {self._settings.timeout:g} s") from None
+                topic = self._topics.setdefault(name, Topic(query, document))
             topic.listeners += 1
             try:
                 yield self._updates(topic)
@@ -123,13 +130,6 @@ class EventBroker:
         self._is_over = True
         for topic in self._topics.values():
             topic.wake()
-
-    async def _create_topic(self, query: Query) -> Topic:
-        try:
-            async with asyncio.timeout(self._settings.timeout):
-                return Topic(query, await self._models.in_registry_thread(query))
-        except TimeoutError:
-            raise DeadlineExceeded(f"the request timed out after {self._settings.timeout:g} s") from None
 
     async def _updates(self, topic: Topic) -> AsyncIterator[Document | None]:
         document: Document | None = topic.document

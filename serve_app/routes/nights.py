@@ -136,7 +136,11 @@ def _nightly_run(row: NightlyRunRow) -> NightlyRun:
 def _training_night(row: TrainingNightRow, ratings: Mapping[str, Any]) -> TrainingNight:
     train, gate, measured = (row.steps.get(step, {}) for step in ("train", "gate", "measure"))
     champion = gate.get("champion")
-    rated = ratings.get(champion, {})
+    rated, exploitability = ratings.get(champion, {}), None
+    if (score := measured.get("exploitability")) is not None:
+        best = score["exploiters"][0]
+        figures = {name: best[name] for name in ("games", "score", "low", "high", "gain")}
+        exploitability = ChampionExploitability(bound=score["bound"], exploiter=best["ref"], **figures)
     return TrainingNight(
         training_night=row.id,
         number=row.number,
@@ -148,17 +152,8 @@ def _training_night(row: TrainingNightRow, ratings: Mapping[str, Any]) -> Traini
         champion=champion,
         rating=rated.get("rating"),
         interval=rated.get("interval"),
-        exploitability=_exploitability(measured.get("exploitability")),
+        exploitability=exploitability,
         errors=[f"{step}: {result['error']}" for step, result in row.steps.items() if "error" in result],
         began_at=row.began_at,
         ended_at=row.ended_at,
     )
-
-
-def _exploitability(measured: Mapping[str, Any] | None) -> ChampionExploitability | None:
-    """The score of the best exploiter against the champion, and the lower bound of a best response's score."""
-    if measured is None:
-        return None
-    best = measured["exploiters"][0]
-    scores = {name: best[name] for name in ("games", "score", "low", "high", "gain")}
-    return ChampionExploitability(bound=measured["bound"], exploiter=best["ref"], **scores)

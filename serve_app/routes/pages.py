@@ -42,7 +42,14 @@ class DocsRoutes:
         self._access = access
         self._document = document
         self._page = PAGE.read_bytes()
-        self._rules = {"content-security-policy": _content_security_policy(self._page), "cache-control": "no-cache"}
+        codes = re.findall(rb"<script>(.*?)</script>", self._page, re.DOTALL)
+        scripts = " ".join(f"'sha256-{b64encode(sha256(code).digest()).decode()}'" for code in codes)
+        # Only the page's own script, and requests to its own server.
+        policy = (
+            f"default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
+            "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
+        self._rules = {"content-security-policy": policy, "cache-control": "no-cache"}
         self._described: dict[tuple[str, ...], bytes] = {}
         """Digests of the served versions → the document: the latest, and the one without examples."""
 
@@ -71,17 +78,6 @@ class DocsRoutes:
         The page also sends requests to this server.
         """
         return Response(self._page, media_type="text/html", headers=self._rules)
-
-
-def _content_security_policy(page: bytes) -> str:
-    """A Content-Security-Policy that permits only the page's own script and requests to its own server."""
-    codes = re.findall(rb"<script>(.*?)</script>", page, re.DOTALL)
-    scripts = [b64encode(sha256(code).digest()).decode() for code in codes]
-    allowed = " ".join(f"'sha256-{digest}'" for digest in scripts)
-    return (
-        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
-        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )
 
 
 FILES = Path(serve_app.__file__).with_name("pages")

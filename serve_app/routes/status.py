@@ -13,7 +13,6 @@ from serve_app.access.access_control import AccessControl
 from serve_app.declaration import Declaration, Response, Scope
 from serve_app.live_versions.registry_watcher import RegistryWatcher
 from serve_app.live_versions.resolver import ModelResolver
-from serve_app.observability.metrics import Report
 from serve_app.observability.prometheus import render
 
 NO_REPLICA = ""
@@ -107,11 +106,7 @@ class StatusRoutes:
 
 
 def _metrics(registry: Registry) -> bytes:
-    return render(registry.replicas.reports() | {NO_REPLICA: _cluster_report(registry)})
-
-
-def _cluster_report(registry: Registry) -> Report:
     counts = registry.evaluations.counts()
     samples = [[[league, state], count] for league, states in counts.items() for state, count in states.items()]
-    silent = len(registry.replicas.silent())
-    return {"league_evaluations": samples, "league_silent_replicas": [[[], silent]]}
+    of_cluster = {"league_evaluations": samples, "league_silent_replicas": [[[], len(registry.replicas.silent())]]}
+    return render(registry.replicas.reports() | {NO_REPLICA: of_cluster})

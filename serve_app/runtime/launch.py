@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -317,16 +317,11 @@ def _await_replicas(application: str, deployment: str, url: str) -> None:
                 raise NotReady(f"the replicas did not start: {_reason(status)}")
             if status is not None and status.status == "RUNNING":
                 replica_count = status.deployments[deployment].replica_states.get("RUNNING", 0)
-                answered |= _ready_replica(client, url)
+                with suppress(httpx.TransportError):
+                    response = client.get(f"{url}/v1/health/ready")
+                    if response.status_code == 200:
+                        answered.add(response.json()["replica"])
             time.sleep(0.05)
-
-
-def _ready_replica(client: httpx.Client, url: str) -> set[str]:
-    try:
-        response = client.get(f"{url}/v1/health/ready")
-    except httpx.TransportError:
-        return set()
-    return {response.json()["replica"]} if response.status_code == 200 else set()
 
 
 def _reason(status: Any) -> str:

@@ -45,17 +45,13 @@ class ServeBypass:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Dispatch a request."""
-        if _root_path and scope["type"] in PROTOCOLS:
-            scope = _below_root(scope)
-        if _application is not None and scope["type"] in PROTOCOLS and scope["path"] not in SERVES_OWN:
+        is_request = scope["type"] in PROTOCOLS
+        if _root_path and is_request:
+            path, raw = scope["path"], scope["raw_path"]
+            if (raw + b"/").startswith(_root_path.encode() + b"/"):  # a proxy may have removed it
+                below, raw_below = path[len(_root_path) :] or "/", raw[len(_root_path) :] or b"/"
+                scope = {**scope, "path": below, "raw_path": raw_below}
+        if _application is not None and is_request and scope["path"] not in SERVES_OWN:
             await _application(scope, receive, send)
         else:
             await self._onward(scope, receive, send)
-
-
-def _below_root(scope: Scope) -> Scope:
-    """A request without the root path, which a proxy may have removed."""
-    path, raw = scope["path"], scope["raw_path"]
-    if not (raw + b"/").startswith(_root_path.encode() + b"/"):
-        return scope
-    return {**scope, "path": path[len(_root_path) :] or "/", "raw_path": raw[len(_root_path) :] or b"/"}

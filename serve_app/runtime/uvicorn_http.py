@@ -165,7 +165,10 @@ class HttpProtocol(HttpToolsProtocol):
         if queue is None:
             queue = _queues[self.server_state] = AcceptQueue(self.server[1])
         while (connection := queue.take()) is not None:
-            task = self.loop.create_task(self.loop.connect_accepted_socket(self._another, connection))
+            protocol = partial(
+                HttpProtocol, self._when_stopping, self.config, self.server_state, self.app_state, self.loop
+            )
+            task = self.loop.create_task(self.loop.connect_accepted_socket(protocol, connection))
             self.server_state.tasks.add(task)  # type: ignore[arg-type]
             task.add_done_callback(self.server_state.tasks.discard)
 
@@ -227,6 +230,3 @@ class HttpProtocol(HttpToolsProtocol):
             if not open_connections[self._address]:
                 del open_connections[self._address]
             self._address = ""
-
-    def _another(self) -> "HttpProtocol":
-        return HttpProtocol(self._when_stopping, self.config, self.server_state, self.app_state, self.loop)

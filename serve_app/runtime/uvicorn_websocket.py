@@ -156,8 +156,11 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         if not self.handshake_initiated:
             super().data_received(data)
             if self.conn.handshake_exc is not None and not self.handshake_initiated:
-                self._refuse_handshake()
-        elif not self._is_open_or_pending:
+                # The library does not accept the request, such as one with a body.
+                self.handshake_initiated = self.handshake_complete = self.close_sent = True
+                self.transport.write(MALFORMED)
+                self.transport.close()
+        elif self.response.status_code != SWITCHING or self.initial_response is not None:  # refused
             super().data_received(data)
         elif self._pending or self._is_held:
             self._pending += data
@@ -168,12 +171,6 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         else:
             self._work(data)
         self._count_incomplete()
-
-    def _refuse_handshake(self) -> None:
-        """Answer a request that the library does not accept, such as one with a body, and close."""
-        self.handshake_initiated = self.handshake_complete = self.close_sent = True
-        self.transport.write(MALFORMED)
-        self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Release what the connection holds."""
@@ -254,11 +251,6 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": reason})
 
     @property
-    def _is_open_or_pending(self) -> bool:
-        """Whether the handshake was accepted, or is pending."""
-        return self.response.status_code == SWITCHING and self.initial_response is None
-
-    @property
     def _is_held(self) -> bool:
         """Whether messages must wait."""
         return self._is_busy or self._stream is None or not self.writable.is_set()
@@ -274,7 +266,9 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
             elif end > len(arrived):
                 break
             if not is_first and self._shared.frames >= MAX_FRAMES_PER_TURN:
-                self._yield_turn()
+                self._is_busy = True
+                self.transport.pause_reading()
+                self.loop.call_soon(self._go_on)
                 break
             self._shared.count_frame(self.loop)
             is_first = False
@@ -282,7 +276,8 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
                 arrived[at] in DATA_FRAMES
                 and arrived[at + 1] & MASKED
                 and length <= self._max_size
-                and self._accepts_new_message
+                and self.conn.current_size is None  # no fragmented message is open
+                and self.conn.state is State.OPEN
             ):
                 start = at + size
                 self._handle_message(
@@ -300,11 +295,6 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
             del self._pending[:at]
         else:
             self._pending += arrived[at:]
-
-    @property
-    def _accepts_new_message(self) -> bool:
-        """Whether a new message may begin: no fragmented message is open, and the connection is not closing."""
-        return self.conn.current_size is None and self.conn.state is State.OPEN
 
     def _wait_for(self, arrived: bytes | bytearray, at: int, payload: int, end: int) -> float:
         """Seconds until a frame that is no complete message may be handled. payload: where its payload begins."""
@@ -348,11 +338,6 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
                 self._pause(answer.pause)
                 return
         self._go_on()
-
-    def _yield_turn(self) -> None:
-        self._is_busy = True
-        self.transport.pause_reading()
-        self.loop.call_soon(self._go_on)
 
     def _pause(self, seconds: float) -> None:
         """Read nothing from the client for a while: it has sent more than it may."""

@@ -24,8 +24,7 @@ from serve_app.inference.stream_codec import FRAMING, REQUEST, BinaryCodec, pars
 from serve_app.inference_protocol.inference import InferResponse
 from serve_app.inference_protocol.rest_codec import read_request, write_response
 from serve_app.inference_protocol.tensors import read_inputs, signature_of
-from serve_app.live_versions.action_selections import ActionSelections
-from serve_app.live_versions.version_cache import LoadedPolicy, load
+from serve_app.live_versions.version_cache import ActionSelections, LoadedPolicy, load
 from tests.support.generated_requests import OPERATIONS, draw_request
 from tests.support.leagues.match_results import record
 from tests.support.leagues.protocol_leagues import every_kind

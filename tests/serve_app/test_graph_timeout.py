@@ -11,7 +11,7 @@ from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions
 from league.registry.registry import Registry
 from serve_app.live_versions import version_cache
-from serve_app.live_versions.action_selections import ActionSelections
+from serve_app.live_versions.version_cache import ActionSelections
 from tests.support.clients.actions import BOARD, act, boards
 from tests.support.leagues.served_leagues import publish
 from tests.support.policies.graphs import endless_mlp

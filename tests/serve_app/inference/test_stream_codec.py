@@ -13,8 +13,7 @@ from league.errors import InvalidInput, ObservationError
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, BinaryCodec, encode_request, parse_request
-from serve_app.live_versions.action_selections import ActionSelections
-from serve_app.live_versions.version_cache import LoadedPolicy, load
+from serve_app.live_versions.version_cache import ActionSelections, LoadedPolicy, load
 from tests.support.leagues.protocol_leagues import DTYPES, every_kind
 
 MAX_ROWS = 64

@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from league.registry.registry import Registry
-from serve_app.live_versions.action_selections import ActionSelections
 from serve_app.live_versions.alias_slots import Alias, AliasSlots
-from serve_app.live_versions.version_cache import LoadedVersion, VersionCache, load
+from serve_app.live_versions.version_cache import ActionSelections, LoadedVersion, VersionCache, load
 from serve_app.runtime.ray_serve import logger
 from tests.support.leagues.served_leagues import publish
 from tests.support.policies.graphs import masked_mlp
