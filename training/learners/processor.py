@@ -34,7 +34,7 @@ def fast_products() -> Iterator[None]:
     It rounds the factors to bfloat16 where the processor multiplies such matrices (AMX), and sums in float32.
     Otherwise it computes in float32, on AMD's processors about twice as fast as torch's default library.
     """
-    matmul = torch.backends.mkldnn.matmul
+    matmul = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
     before = matmul.fp32_precision
     matmul.fp32_precision = "bf16"
     try:

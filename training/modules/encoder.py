@@ -155,8 +155,16 @@ class Flat(nn.Flatten):
         return super().forward(values) if values.ndim > 1 else values.unsqueeze(1)
 
 
+SMALL_IMAGE = 100
+"""Pixels of the largest images, such as boards of games, whose convolutions are computed as products of patches."""
+
+
 class ImageEncoder(nn.Module):
-    """Images (B, height, width, channels) or (B, channels, height, width) → convolutions → (B, width)."""
+    """Images (B, height, width, channels) or (B, channels, height, width) → convolutions → (B, width).
+
+    With gradients, convolutions of small images are matrix products on the CPU: libraries optimise convolutions for
+    many channels. Only kernels of one pixel may follow the first layer, since others would scatter gradients.
+    """
 
     def __init__(
         self, numbers: nn.Module, shape: tuple[int, ...], convolutions: Convolutions, channels_axis: Channels
@@ -164,6 +172,7 @@ class ImageEncoder(nn.Module):
         super().__init__()
         self.numbers, self._is_first = numbers, channels_axis == "first"
         height, width, channels = (*shape[1:], shape[0]) if self._is_first else shape
+        self._is_small = height * width <= SMALL_IMAGE and all(kernel == 1 for _, kernel, _ in convolutions[1:])
         layers: list[nn.Module] = []
         for filters, kernel, stride in convolutions:
             if min(height, width) < kernel:
@@ -180,7 +189,23 @@ class ImageEncoder(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         numbers = self.numbers(values)
+        if self._is_small and numbers.is_cpu and torch.is_grad_enabled() and not torch.compiler.is_exporting():
+            return self._products(numbers.permute(0, 2, 3, 1) if self._is_first else numbers)
         return self.convolutions(numbers if self._is_first else numbers.permute(0, 3, 1, 2))
+
+    def _products(self, images: Tensor) -> Tensor:
+        """Compute the convolutions of images (B, height, width, channels)."""
+        for layer in self.convolutions:
+            if isinstance(layer, nn.Conv2d):
+                (kernel, _), (stride, _) = layer.kernel_size, layer.stride
+                if kernel > 1:
+                    patches = images.unfold(1, kernel, stride).unfold(2, kernel, stride)
+                    images = patches.permute(0, 1, 2, 4, 5, 3).flatten(3)
+                else:  # without the slow gradient of `unfold`
+                    images = images[:, ::stride, ::stride]
+                weight = layer.weight.permute(0, 2, 3, 1).flatten(1)
+                images = nn.functional.linear(images, weight, layer.bias).relu()
+        return images.permute(0, 3, 1, 2).flatten(1)
 
 
 def _feature(

@@ -71,6 +71,26 @@ def test_convolutions_are_equivariant_to_translation() -> None:
     assert not torch.allclose(left, right)
 
 
+@pytest.mark.parametrize("shape", [(6, 7, 2), (2, 6, 7)], ids=["last", "first"])
+@pytest.mark.parametrize("layers", [[(5, 4, 1), (3, 1, 1)], [(4, 3, 2)]], ids=["two layers", "stride"])
+def test_small_images_have_equal_features_and_gradients_as_products(shape: tuple[int, ...], layers: list) -> None:
+    torch.manual_seed(0)
+    features = ObservationFeatures(spaces.Dict(observation=spaces.Box(0, 1, shape, np.float32)), layers)
+    image = torch.rand(9, *shape)
+    weights = torch.randn(9, features.width)
+    with torch.no_grad():
+        convolved = features({"observation": image})
+    products = features({"observation": image})
+    torch.testing.assert_close(products, convolved)
+    (products * weights).sum().backward()
+    gradients = [parameter.grad for parameter in features.parameters()]
+    features.zero_grad()
+    encoder = features.parts[0]
+    encoder._is_small = False
+    (features({"observation": image}) * weights).sum().backward()
+    torch.testing.assert_close(gradients, [parameter.grad for parameter in features.parameters()])
+
+
 def test_strides_reduce_the_width() -> None:
     space = spaces.Dict(observation=spaces.Box(0, 255, (84, 84, 4), np.uint8))
     features = ObservationFeatures(space, convolutions=[(16, 8, 4), (32, 4, 2)])
