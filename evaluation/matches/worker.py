@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections import OrderedDict
 from collections.abc import Iterable
+from types import MappingProxyType
 
 from evaluation.matches.game_loop import play_matches
 from evaluation.matches.seating import Roster
@@ -42,10 +43,18 @@ class MatchWorker:
         # Games create many objects. Without freezing, each collection would traverse everything that is loaded.
         gc.freeze()
 
-    def play(self, schedule: Schedule, positions: Iterable[int], *, expendable: bool = False) -> list[Match]:
+    def play(
+        self,
+        schedule: Schedule,
+        positions: Iterable[int],
+        *,
+        expendable: bool = False,
+        guests: Roster = MappingProxyType({}),
+    ) -> list[Match]:
         """Play the matches at `positions`, in that order.
 
         expendable: whether this process may exit to end a game that hangs: see watchdog.py.
+        guests: contestants of the schedule that are not in the registry.
         Raises EnvironmentMismatch if the schedule is for another environment, and the errors of `play_matches` and of
         loading.
         """
@@ -56,10 +65,10 @@ class MatchWorker:
             )
         positions = list(positions)
         refs = dict.fromkeys(ref for position in positions for ref in schedule.contestants_at(position))
-        mixtures = {ref: mixture for ref in refs if (mixture := self._mixture(ref)) is not None}
+        mixtures = {ref: mixture for ref in refs if ref not in guests and (mixture := self._mixture(ref)) is not None}
         members = [f"{schedule.league}@{number}" for mixture in mixtures.values() for number in mixture.versions]
         playing = dict.fromkeys([*(ref for ref in refs if ref not in mixtures), *members])
-        roster: Roster = {ref: self.contestant(ref) for ref in playing}
+        roster: Roster = {ref: guests[ref] if ref in guests else self.contestant(ref) for ref in playing}
         seated = self.interface.apart() if schedule.scoring == "team" else self.interface
         settings = self.config.play
         deadline = Deadline(settings.game_seconds, expendable)

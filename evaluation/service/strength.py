@@ -1,24 +1,33 @@
-"""Strength during training: a version that a run has published plays the champion and an anchor.
+"""Strength during training: a version that a run has published plays the champion and an anchor, a trial of a sweep the
+champion and all anchors.
 
-The scores show the progress of a run. They are no evidence: all versions play the same games, which are not in the
-ledger and count neither in ratings nor in verdicts. A version plays them again in the same way, because the schedule
-and its seed are fixed.
+The scores show the progress of a run and compare trials. They are no evidence: all versions play the same games, which
+are not in the ledger and count neither in ratings nor in verdicts. A version plays them again in the same way, because
+the schedule and its seed are fixed.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
+from evaluation.matches.seating import Roster
 from evaluation.matches.tournament import chunks_of
 from evaluation.matches.worker import MatchWorker, num_envs
-from evaluation.schedules.builders import ANCHOR, strength_test
+from evaluation.schedules.builders import strength_test
 from evaluation.statistics.payoff import score_interval
-from league.errors import EnvironmentMismatch, LeagueError, UnknownAlias
-from league.policies.loading import check_eligible, pinned
-from league.refs import CHAMPION, of_league
+from league.errors import LeagueError
+from league.policies.loading import strength_opponents
+from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
+from league.registry.storage.manifest import MANIFEST, Manifest
 from league.registry.storage.rows import StrengthRow, VersionRow
+from league.registry.training.strength import StrengthScore
 from league.results.records import GAMES_PER_BLOCK, Match
 
 MOST_SECONDS = 60.0
@@ -26,30 +35,15 @@ MOST_SECONDS = 60.0
 a run from ending."""
 
 
-def strength_opponents(registry: Registry, version: VersionRow) -> list[str]:
-    """Return the fixed references of a version's opponents: the champion, if there is one, and an anchor.
+def opponents_of(registry: Registry, version: VersionRow) -> list[str]:
+    """Return the fixed references of a version's opponents: the champion, if there is one, and the first anchor.
 
-    The anchor is the first of `gate.anchors` that can play and is neither the version nor the champion, otherwise
-    `script:random`. An exploiter plays the version that it was trained against.
+    An exploiter plays the version that it was trained against.
     """
     if version.exploits is not None:
         return [version.exploits]
-    league = registry.leagues.get(version.league)
-    refs = [f"@{CHAMPION}", *(anchor.ref for anchor in league.config.gate.anchors)]
-    champion, *anchors = (_opponent(registry, version, ref) for ref in refs)
-    anchor = next((opponent for opponent in anchors if opponent not in (None, champion)), ANCHOR)
-    return [opponent for opponent in (champion, anchor) if opponent is not None]
-
-
-def _opponent(registry: Registry, version: VersionRow, ref: str) -> str | None:
-    """A reference that is pinned; None if it does not exist, cannot play, or is the version itself."""
     config = registry.leagues.get(version.league).config
-    try:
-        opponent = pinned(of_league(ref, version.league), version.league, registry)
-        check_eligible(opponent, registry, config)
-    except (UnknownAlias, EnvironmentMismatch):
-        return None
-    return None if opponent == version.ref else opponent
+    return strength_opponents(config, registry, version=version.ref, most_anchors=1)
 
 
 def measure_strength(registry: Registry, worker: MatchWorker, number: int, games: int) -> list[StrengthRow]:
@@ -68,35 +62,48 @@ def measure_strength(registry: Registry, worker: MatchWorker, number: int, games
         LeagueError: An unknown or retired version, and the errors of `MatchWorker.play`.
     """
     version = registry.versions.get(worker.config.league, number)
-    rows = []
-    for opponent in strength_opponents(registry, version):
-        matches = _play(worker, version.ref, opponent, games // GAMES_PER_BLOCK)
-        scores = [match.score(match.contestants.index(version.ref)) for match in matches]
-        mean, low, high = score_interval(scores)
-        rows.append(
-            StrengthRow(
-                league=version.league,
-                version=number,
-                opponent=opponent,
-                run=version.run,
-                steps=version.steps,
-                games=GAMES_PER_BLOCK * len(matches),
-                score=mean,
-                low=low,
-                high=high,
-                at=datetime.now(UTC),
-            )
-        )
-    return rows
+    origin: dict[str, Any] = {"league": version.league, "version": number, "run": version.run, "steps": version.steps}
+    scores = (score_against(worker, version.ref, opponent, games) for opponent in opponents_of(registry, version))
+    return [StrengthRow(**asdict(score), **origin, at=datetime.now(UTC)) for score in scores]
 
 
-def _play(worker: MatchWorker, version: str, opponent: str, blocks: int) -> list[Match]:
-    schedule = strength_test(worker.config, worker.interface, version, opponent, blocks)
+def measure_export(worker: MatchWorker, directory: Path, opponents: Sequence[str], games: int) -> list[StrengthScore]:
+    """Play the matches of a policy that is not published.
+
+    Args:
+        worker: Plays matches of the league.
+        directory: Its graphs and its manifest.
+        opponents: Fixed references.
+        games: Games per opponent, at least 2.
+
+    Returns:
+        One score per opponent.
+
+    Raises:
+        LeagueError: A corrupt file, and the errors of `MatchWorker.play`.
+    """
+    file = directory / MANIFEST
+    manifest = Manifest.from_json(file.read_bytes(), str(file))
+    policies = {
+        policy: OnnxPolicy(directory / part.file, part, manifest.has_distribution)
+        for policy, part in manifest.policies.items()
+    }
+    ref = f"{manifest.league}@{manifest.version}"
+    guests = {ref: {agent: (policy, policies[policy]) for agent, policy in worker.interface.policies.items()}}
+    return [score_against(worker, ref, opponent, games, guests) for opponent in opponents]
+
+
+def score_against(
+    worker: MatchWorker, ref: str, opponent: str, games: int, guests: Roster = MappingProxyType({})
+) -> StrengthScore:
+    """Play a contestant's matches against an opponent. guests: see `MatchWorker.play`."""
+    schedule = strength_test(worker.config, worker.interface, ref, opponent, games // GAMES_PER_BLOCK)
     matches, end = list[Match](), time.process_time() + MOST_SECONDS
     for chunk in chunks_of(schedule.length, 0, num_envs(worker.config)):
-        matches += worker.play(schedule, chunk, expendable=True)
+        matches += worker.play(schedule, chunk, expendable=True, guests=guests)
         if time.process_time() > end:
             break
     if not matches:
         raise LeagueError(f"schedule {schedule.id} has no matches")
-    return matches
+    mean, low, high = score_interval([match.score(match.contestants.index(ref)) for match in matches])
+    return StrengthScore(opponent, GAMES_PER_BLOCK * len(matches), mean, low, high)

@@ -20,14 +20,16 @@ class SweepConfig(Part):
     """Search over training settings (`league sweep`)."""
 
     parameters: dict[str, JSON | list[Any]] = Field(min_length=1)
-    """Training setting → a list of values (grid search), or a distribution: `{choice: [..]}`, `{uniform: [low, high]}`,
-    `{loguniform: [low, high]}`, `{randint: [low, high]}`. Settings of one policy are `per_policy.<id>.<setting>`."""
+    """Training setting → a list of values (grid search), or a distribution of Ray Tune with its arguments:
+    `{choice: [..]}`, `{uniform: [low, high]}`, `{loguniform: [low, high]}`, `{randint: [low, high]}`, `{randn: [mean,
+    deviation]}`, `{quniform: [low, high, step]}`, … Settings of one policy are `per_policy.<id>.<setting>`."""
     samples: int = Field(default=1, ge=1)
     """Samples of the random parameters for each combination of the lists."""
     concurrent: int = Field(default=1, ge=1)
     """Maximum number of concurrent trials, also limited by the CPUs."""
-    metric: str = "return"
-    """Metric of the run by which trials are compared, such as `return` or `<policy>/return`."""
+    metric: str = "auto"
+    """What trials are compared by: `strength`, the mean score against the champion and the anchors; or a metric of the
+    run, such as `return` or `<policy>/return`. auto: `strength` in a league with two or more sides, else `return`."""
     mode: Literal["max", "min"] = "max"
     asha: AshaConfig | None = None
     """Early stopping; null trains each trial to its full budget."""

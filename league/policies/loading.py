@@ -355,6 +355,35 @@ def eligible(registry: Registry, league: str) -> list[VersionRow]:
     return [version for version in present if version.manifest.environment_digest == digest]
 
 
+def strength_opponents(
+    config: LeagueConfig, registry: Registry, *, version: str | None = None, most_anchors: int | None = None
+) -> list[str]:
+    """Return whom the strength of policies in training is measured against, as fixed references.
+
+    Args:
+        config: The league.
+        registry: The registry.
+        version: The version that plays, which is not its own opponent.
+        most_anchors: Maximum number of anchors; None for all.
+
+    Returns:
+        The champion, if there is one, and the anchors of the gate that can play, otherwise `script:random`.
+    """
+
+    def opponent(ref: str) -> str | None:
+        try:
+            fixed = pinned(of_league(ref, config.league), config.league, registry)
+            check_eligible(fixed, registry, config)
+        except (UnknownAlias, EnvironmentMismatch):
+            return None
+        return None if fixed == version else fixed
+
+    champion = opponent(f"@{CHAMPION}")
+    pinned_anchors = dict.fromkeys(opponent(anchor.ref) for anchor in config.gate.anchors)
+    anchors = [ref for ref in pinned_anchors if ref not in (None, champion)][:most_anchors]
+    return [ref for ref in (champion, *(anchors or BASELINES[:1])) if ref is not None]
+
+
 def check_eligible(ref: str, registry: Registry, config: LeagueConfig) -> None:
     """Raise EnvironmentMismatch if `ref` is a version of another league or was trained in another environment.
 

@@ -53,47 +53,74 @@ def publish(
     """
 
     def build(staging: Path, number: int) -> Manifest:
-        modules = load_modules(checkpoint.path, config, interface)
-        observations = parity.collect_observations(config.environment, interface, modules, seed=config.training.seed)
-        policies = {}
-        for policy, module in modules.items():
-            spaces, file, probes = interface.of_policy(policy), f"{policy}.onnx", f"{policy}{PROBES}"
-            export_policy(module, spaces, staging / file)
-            inputs, outputs, state = graph_tensors(module, spaces)
-            proof = parity.check_parity(staging / file, policy, module, observations[policy], spaces.action)
-            policy_probes = parity.probes(OnnxPolicy(staging / file), observations[policy])
-            (staging / probes).write_bytes(policy_probes.to_bytes())
-            policies[policy] = PolicyManifest(
-                file=file,
-                observation=spaces.observation,
-                action=spaces.action,
-                inputs=inputs,
-                outputs=outputs,
-                state=state,
-                parity=proof,
-                probes=probes,
-            )
         shutil.copytree(checkpoint.path, staging / TRAINING)
-        return Manifest(
-            league=config.league,
-            version=number,
-            created_at=datetime.now(UTC),
+        return export(
+            checkpoint,
+            staging,
+            number,
+            config=config,
             interface=interface,
-            policies=policies,
-            environment=config.environment,
-            environment_digest=config.environment.digest(),
-            algorithm=config.training.algorithm,
-            settings=config.training.model_dump(mode="json", by_alias=True),
-            seed=config.training.seed,
-            steps=checkpoint.steps,
             parent=parent,
-            role=MAIN if exploits is None else EXPLOITER,
             exploits=exploits,
             git_commit=git_commit,
-            stack=installed(),
         )
 
     return registry.publisher.publish(config.league, build, source=checkpoint.source, parent=parent)
+
+
+def export(
+    checkpoint: Checkpoint,
+    directory: Path,
+    number: int,
+    *,
+    config: LeagueConfig,
+    interface: Interface,
+    parent: int | None = None,
+    exploits: str | None = None,
+    git_commit: str | None = None,
+) -> Manifest:
+    """Write graphs and probes of the policies of `checkpoint` to `directory`, check parity, and return the manifest.
+
+    number: of the version. parent, exploits, git_commit: see `publish`. Raises ParityError.
+    """
+    modules = load_modules(checkpoint.path, config, interface)
+    observations = parity.collect_observations(config.environment, interface, modules, seed=config.training.seed)
+    policies = {}
+    for policy, module in modules.items():
+        spaces, file, probes = interface.of_policy(policy), f"{policy}.onnx", f"{policy}{PROBES}"
+        export_policy(module, spaces, directory / file)
+        inputs, outputs, state = graph_tensors(module, spaces)
+        proof = parity.check_parity(directory / file, policy, module, observations[policy], spaces.action)
+        policy_probes = parity.probes(OnnxPolicy(directory / file), observations[policy])
+        (directory / probes).write_bytes(policy_probes.to_bytes())
+        policies[policy] = PolicyManifest(
+            file=file,
+            observation=spaces.observation,
+            action=spaces.action,
+            inputs=inputs,
+            outputs=outputs,
+            state=state,
+            parity=proof,
+            probes=probes,
+        )
+    return Manifest(
+        league=config.league,
+        version=number,
+        created_at=datetime.now(UTC),
+        interface=interface,
+        policies=policies,
+        environment=config.environment,
+        environment_digest=config.environment.digest(),
+        algorithm=config.training.algorithm,
+        settings=config.training.model_dump(mode="json", by_alias=True),
+        seed=config.training.seed,
+        steps=checkpoint.steps,
+        parent=parent,
+        role=MAIN if exploits is None else EXPLOITER,
+        exploits=exploits,
+        git_commit=git_commit,
+        stack=installed(),
+    )
 
 
 def load_modules(checkpoint: Path, config: LeagueConfig, interface: Interface) -> dict[str, PolicyModule]:

@@ -1,12 +1,15 @@
-"""Expands a sweep's parameters into trials: all combinations of its lists, with samples of its distributions.
+"""Expands a sweep's parameters into trials with Ray Tune's search spaces: all combinations of lists, with samples of
+distributions.
 
-The same configuration gives the same trials: samples derive from `training.seed` and the trial's number.
+The same configuration gives the same trials: samples derive from `training.seed`. All trials are known before the first
+one starts, so that all are checked, and an interrupted sweep continues with the same ones.
 """
 
-import itertools
 import math
-from collections.abc import Sequence
 from typing import Any
+
+from ray import tune
+from ray.tune.search.variant_generator import generate_variants
 
 from league.config.league import LeagueConfig
 from league.config.sweep import SweepConfig
@@ -17,48 +20,71 @@ Settings = dict[str, Any]
 """Training setting, with dots for nested ones (`per_policy.cars.lr`) → value."""
 
 DIGITS = 4
-"""Significant digits of sampled values, for readability."""
+"""Significant digits of numbers in tables and messages."""
+DISTRIBUTIONS = {
+    "choice": "[value, …]",
+    "uniform": "[low, high] with low < high",
+    "quniform": "[low, high, step] with low < high",
+    "loguniform": "[low, high] with 0 < low < high",
+    "qloguniform": "[low, high, step] with 0 < low < high",
+    "randn": "[mean, deviation]",
+    "qrandn": "[mean, deviation, step]",
+    "randint": "[low, high] in whole numbers with low < high",
+    "qrandint": "[low, high, step] in whole numbers with low < high",
+    "lograndint": "[low, high] in whole numbers with 0 < low < high",
+    "qlograndint": "[low, high, step] in whole numbers with 0 < low < high",
+}
+"""Distribution of Ray Tune → its arguments."""
 
 
 def plan(config: LeagueConfig, sweep: SweepConfig) -> list[Settings]:
     """Return the settings of each trial, in order. Raises ConfigError for an invalid parameter."""
-    for name, values in sweep.parameters.items():
-        if fault := _fault(values):
-            raise ConfigError(f"sweep.parameters.{name}: {fault}, got {values!r}")
-    lists = {name: values for name, values in sweep.parameters.items() if isinstance(values, list)}
-    combinations = itertools.product(*lists.values())
-    trials = [dict(zip(lists, values, strict=True)) for values in combinations for _ in range(sweep.samples)]
-    for number, settings in enumerate(trials):
-        rng = generator(config.training.seed, "sweep", number)
-        for name, values in sweep.parameters.items():
-            if not isinstance(values, dict):
-                continue
-            (kind, arguments), *_ = values.items()
-            match kind:
-                case "choice":
-                    settings[name] = arguments[rng.integers(len(arguments))]
-                case "randint":  # as in Ray Tune, without the upper bound
-                    settings[name] = int(rng.integers(*arguments))
-                case _:
-                    low, high = arguments
-                    ends = (math.log(low), math.log(high)) if kind == "loguniform" else (low, high)
-                    drawn = rng.uniform(*ends)
-                    value = math.exp(drawn) if kind == "loguniform" else drawn
-                    settings[name] = min(max(float(f"{value:.{DIGITS}g}"), float(low)), float(high))
-    return [{name: settings[name] for name in sweep.parameters} for settings in trials]
+    space = {name: _domain(name, values) for name, values in sweep.parameters.items()}
+    rng = generator(config.training.seed, "sweep")
+    return [settings for _ in range(sweep.samples) for _, settings in generate_variants(space, random_state=rng)]
+
+
+def _domain(name: str, values: Any) -> Any:
+    """Return Tune's domain for the values of a parameter."""
+    place = f"sweep.parameters.{name}: expected"
+    if isinstance(values, list):
+        if not values:
+            raise ConfigError(f"{place} at least one value, got {values!r}")
+        return tune.grid_search(values)
+    if len(values) != 1 or next(iter(values)) not in DISTRIBUTIONS:
+        raise ConfigError(f"{place} a list of values, or one of {', '.join(DISTRIBUTIONS)}, got {values!r}")
+    ((kind, arguments),) = values.items()
+    if not isinstance(arguments, list) or not _are_arguments(kind, arguments):
+        raise ConfigError(f"{place} {kind}: {DISTRIBUTIONS[kind]}, got {values!r}")
+    try:
+        return tune.choice(arguments) if kind == "choice" else getattr(tune, kind)(*arguments)
+    except ValueError as error:  # bounds that are not multiples of the step
+        raise ConfigError(f"{place} {kind}: {DISTRIBUTIONS[kind]}, got {values!r}: {error}") from error
+
+
+def _are_arguments(kind: str, arguments: list[Any]) -> bool:
+    if kind == "choice":
+        return bool(arguments)
+    number = int if "randint" in kind else int | float
+    if len(arguments) != 2 + kind.startswith("q"):
+        return False
+    if not all(isinstance(argument, number) and math.isfinite(argument) for argument in arguments):
+        return False
+    first, second, *step = arguments
+    return ("randn" in kind or first < second) and ("log" not in kind or first > 0) and all(width > 0 for width in step)
 
 
 def applied(config: LeagueConfig, settings: Settings) -> LeagueConfig:
     """Return the league with `settings`. Raises ConfigError for unknown or invalid ones."""
-    return config.with_training(**_nested(settings, config.training.model_dump(mode="json", by_alias=True)))
+    return config.with_training(**nested(settings, config.training.model_dump(mode="json", by_alias=True)))
 
 
-def nested(settings: Settings) -> dict[str, Any]:
-    """Return settings as in a league's file: `{"per_policy.cars.lr": 1}` → `{"per_policy": {"cars": {"lr": 1}}}`."""
-    return _nested(settings, {})
+def nested(settings: Settings, document: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Return settings as in a league's file: `{"per_policy.cars.lr": 1}` → `{"per_policy": {"cars": {"lr": 1}}}`.
 
-
-def _nested(settings: Settings, document: dict[str, Any]) -> dict[str, Any]:
+    document: settings that these are added to, which are changed in place.
+    """
+    document = {} if document is None else document
     for name, value in settings.items():
         *path, last = name.split(".")
         part = document
@@ -72,23 +98,11 @@ def _nested(settings: Settings, document: dict[str, Any]) -> dict[str, Any]:
     return document
 
 
-def _fault(values: Any) -> str | None:
-    if isinstance(values, list):
-        return None if values else "expected at least one value"
-    if len(values) != 1 or next(iter(values)) not in ("choice", "uniform", "loguniform", "randint"):
-        return "expected a list of values, or one of choice, uniform, loguniform and randint"
-    kind, arguments = next(iter(values.items()))
-    if kind == "choice":
-        return None if isinstance(arguments, list) and arguments else "expected choice: [value, …]"
-    if not (
-        isinstance(arguments, Sequence)
-        and len(arguments) == 2
-        and all(isinstance(bound, int | float) and math.isfinite(bound) for bound in arguments)
-        and arguments[0] < arguments[1]
-        and (kind != "loguniform" or arguments[0] > 0)
-    ):
-        least = "0 < low < high" if kind == "loguniform" else "low < high"
-        return f"expected {kind}: [low, high] with {least}"
-    if kind == "randint" and not all(isinstance(bound, int) for bound in arguments):
-        return "expected randint: [low, high] in whole numbers"
-    return None
+def format_value(value: Any) -> str:
+    """Format a setting, with a few digits of a number."""
+    return str(float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value)
+
+
+def format_settings(settings: Settings) -> str:
+    """Format the settings of a trial: `lr 0.001, hidden [64, 64]`."""
+    return ", ".join(f"{name} {format_value(value)}" for name, value in settings.items())

@@ -7,7 +7,7 @@ weak trial run longer; it never reverts a decision.
 """
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,11 @@ from league.config.sweep import SweepConfig
 from league.environments.building import interface as interface_of
 from league.errors import ConfigError, LeagueError
 from league.interface import Interface
-from league.policies.loading import check_contestants
+from league.policies.loading import check_contestants, strength_opponents
 from league.ray_cluster import UNLIMITED, LocalRay, connected, usable_cpus
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
+from league.settings import Storage
 from training.algorithms import metrics
 from training.export.publish import Checkpoint, git_commit, publish
 from training.rllib_compat import silence_tune
@@ -35,7 +36,8 @@ from training.runs.run_directory import CHECKPOINTS, START, pin_opponents
 from training.runs.train import check
 from training.runs.trial import FROM_SCRATCH, MAX_THREADS, StartState, TrialPlan, read_progress
 from training.runs.tune import cpu_share, fit, placement, run_config
-from training.sweeps.search_space import Settings, applied, plan
+from training.sweeps.search_space import Settings, applied, format_settings, plan
+from training.sweeps.strength import STRENGTH, StrengthGames, StrengthTest
 from training.sweeps.sweep_directory import SweepDirectory, TrialOutcome
 from training.sweeps.trial import (
     NUMBER,
@@ -44,7 +46,6 @@ from training.sweeps.trial import (
     SweepCallback,
     SweepProgress,
     SweepTrial,
-    format_settings,
 )
 
 
@@ -85,6 +86,7 @@ def sweep(
     local: LocalRay = UNLIMITED,
     config_path: Path | None = None,
     console: Console | None = None,
+    open_games: Callable[[Storage], StrengthGames] | None = None,
 ) -> SweepReport:
     """Train the league once per trial of `config.sweep`, and publish the newest checkpoint of the best one.
 
@@ -100,6 +102,8 @@ def sweep(
         resume: Continue the league's newest sweep, which was interrupted.
         publish_best: Whether to publish the best trial.
         address, local, config_path, console: See `train`.
+        open_games: Opens what plays the games that measure strength, in the process of each trial. Required by the
+            metric `strength`.
 
     Raises:
         LeagueError: `config` has no sweep; an invalid parameter, value or metric, before anything starts; all trials
@@ -110,18 +114,27 @@ def sweep(
     silence_tune()
     interface = interface_of(config)
     trials = plan(config, config.sweep)
-    _check(config, config.sweep, trials, interface)
+    config = config.model_copy(update={"sweep": _with_metric(config.sweep, interface)})
+    assert config.sweep is not None
+    _check(config, config.sweep, trials, interface, can_play=open_games is not None)
     check_contestants(config, interface, registry)
     registry.leagues.register(config, interface)
     interrupted = SweepDirectory.resume(registry.storage, config, trials) if resume else None
     leagues = [applied(config, settings) for settings in trials]
     pins = {} if interrupted else pin_opponents(config, registry, interface, leagues)
+    opponents = strength_opponents(config, registry) if config.sweep.metric == STRENGTH else []
     with connected(address, registry.storage, local) as dashboard:
-        directory = interrupted or SweepDirectory.begin(registry.storage, config, pins, trials, git_commit(config_path))
+        directory = interrupted or SweepDirectory.begin(
+            registry.storage, config, pins, trials, git_commit(config_path), opponents
+        )
         with directory.locked(), SweepProgress(console or Console(), directory, config.sweep.mode) as progress:
             if dashboard:
                 progress.say(f"Ray's dashboard: {dashboard}")
-            errors = _run(directory, interface, registry, progress)
+            test = None
+            if open_games is not None and directory.record.opponents:
+                progress.say(f"Strength: mean score against {', '.join(directory.record.opponents)}.")
+                test = StrengthTest(directory.record.opponents, open_games)
+            errors = _run(directory, interface, registry, progress, test)
         return _conclude(directory, errors, interface, registry, publish_best)
 
 
@@ -154,21 +167,38 @@ def _conclude(
     return SweepReport(sweep.path, trials, best, version, is_whole)
 
 
-def _check(config: LeagueConfig, sweep: SweepConfig, trials: list[Settings], interface: Interface) -> None:
-    if sweep.metric not in (names := metrics.metric_names(interface, config.training.algorithm)):
+def _with_metric(sweep: SweepConfig, interface: Interface) -> SweepConfig:
+    """Return the sweep with the metric that `auto` stands for."""
+    metric = STRENGTH if len(interface.sides) > 1 else metrics.RETURN
+    return sweep.model_copy(update={"metric": metric}) if sweep.metric == "auto" else sweep
+
+
+def _check(
+    config: LeagueConfig, sweep: SweepConfig, trials: list[Settings], interface: Interface, can_play: bool
+) -> None:
+    names = metrics.metric_names(interface, config.training.algorithm) | {STRENGTH}
+    if sweep.metric not in names:
         raise ConfigError(f"sweep.metric: unknown metric {sweep.metric!r}; expected one of {', '.join(sorted(names))}")
     for settings in trials:
         try:
             check(applied(config, settings), interface)
         except ConfigError as error:
             raise ConfigError(f"sweep.parameters: {format_settings(settings)}: {error}") from error
+    if sweep.metric == STRENGTH and not can_play:
+        raise ConfigError("sweep.metric: strength is measured by games, for which this sweep has no function")
+    if sweep.metric == STRENGTH and any(applied(config, settings).training.strength is None for settings in trials):
+        raise ConfigError("sweep.metric: strength is measured by the games of training.strength, which is null")
     budget = _max_steps(applied(config, settings) for settings in trials)
     if sweep.asha is not None and sweep.asha.grace_steps > budget:
         raise ConfigError(f"sweep.asha.grace_steps: {sweep.asha.grace_steps} exceeds a trial's steps, {budget}")
 
 
 def _run(
-    sweep: SweepDirectory, interface: Interface, registry: Registry, progress: SweepProgress
+    sweep: SweepDirectory,
+    interface: Interface,
+    registry: Registry,
+    progress: SweepProgress,
+    strength: StrengthTest | None,
 ) -> dict[int, LeagueError]:
     """Train the unfinished trials; return the errors of those that failed."""
     settings = _settings(sweep)
@@ -204,7 +234,7 @@ def _run(
         )
     tuner = tune.Tuner(
         tune.with_resources(
-            tune.with_parameters(SweepTrial, plans=plans, metric=settings.metric),
+            tune.with_parameters(SweepTrial, plans=plans, metric=settings.metric, strength=strength),
             lambda config: placements[config[TRIAL][NUMBER]],
         ),
         param_space={TRIAL: tune.grid_search([_shown(sweep, number) for number in numbers])},

@@ -11,6 +11,7 @@
 
 import secrets
 import shutil
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -38,17 +39,25 @@ class SweepRecord(BaseModel):
     pins: dict[str, str]
     trials: tuple[Settings, ...]
     """The settings of each trial."""
+    opponents: tuple[str, ...] = ()
+    """Whom the strength of trials is measured against, as fixed references; empty with another metric."""
     git_commit: str | None
     started_at: datetime
     complete: bool = False
 
 
 class TrialOutcome(BaseModel):
-    """The result of a trial. score: the mean metric of its last reports, or None without values."""
+    """The result of a trial.
+
+    score: the mean metric of its last reports, or its last strength; None without values. low, high: the bounds of the
+    strength's 95 % interval.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     score: float | None
+    low: float | None = None
+    high: float | None = None
     steps: int
     seconds: float
     ended_early: bool
@@ -79,14 +88,16 @@ class SweepDirectory:
         pins: dict[str, str],
         trials: list[Settings],
         git_commit: str | None,
+        opponents: Sequence[str] = (),
     ) -> Self:
-        """Create the directory of a new sweep. trials: the settings of each."""
+        """Create the directory of a new sweep. trials: the settings of each. opponents: see `SweepRecord`."""
         started_at = datetime.now(UTC)
         path = _sweeps(storage, config.league) / f"{started_at:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
         record = SweepRecord(
             config=with_pins(config, pins),
             pins=pins,
             trials=tuple(trials),
+            opponents=tuple(opponents),
             git_commit=git_commit,
             started_at=started_at,
         )

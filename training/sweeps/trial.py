@@ -10,10 +10,12 @@ from ray.tune.experiment import Trial as TuneTrial
 from rich.console import Console
 from rich.progress import TextColumn, TimeRemainingColumn
 
+from league.errors import LeagueError
 from training.rllib_compat import NotPickled
 from training.runs.progress import ProgressDisplay, clock
 from training.runs.trial import Trial
-from training.sweeps.search_space import Settings
+from training.sweeps.search_space import format_settings
+from training.sweeps.strength import HIGH, LOW, STRENGTH, StrengthTest, trial_strength
 from training.sweeps.sweep_directory import SweepDirectory, TrialOutcome
 
 
@@ -25,7 +27,7 @@ class SweepProgress(ProgressDisplay):
         self._trials = sweep.record.trials
         self._sign = 1 if mode == "max" else -1
         over = {number: outcome for number in range(len(self._trials)) if (outcome := sweep.outcome(number))}
-        self._scores = {number: outcome.score for number, outcome in over.items()}
+        self._outcomes = dict(over)
         self._done = dict.fromkeys(over, 1.0)
         self._over = len(over)
         self._bar = self._bars.add_task("", total=len(self._trials), best="")
@@ -33,7 +35,7 @@ class SweepProgress(ProgressDisplay):
 
     def update(self, number: int, outcome: TrialOutcome, done: float) -> None:
         """Show the fraction of a trial's budget spent, in [0, 1], and its result so far."""
-        self._done[number], self._scores[number] = done, outcome.score
+        self._done[number], self._outcomes[number] = done, outcome
         self._show()
 
     def over(self, number: int, outcome: TrialOutcome) -> None:
@@ -44,56 +46,80 @@ class SweepProgress(ProgressDisplay):
         early = ", ended early" if outcome.ended_early else ""
         self.say(
             f"{self._over} of {len(self._trials)}: trial {number} ({format_settings(self._trials[number])}): "
-            f"{format_score(outcome.score)} after {outcome.steps:,} steps, {clock(outcome.seconds)}{early}"
+            f"{format_score(outcome)} after {outcome.steps:,} steps, {clock(outcome.seconds)}{early}"
         )
 
     def _show(self) -> None:
-        scores = {number: score for number, score in self._scores.items() if score is not None}
+        scores = {number: outcome.score for number, outcome in self._outcomes.items() if outcome.score is not None}
         best = max(scores, key=lambda number: self._sign * scores[number], default=None)
-        summary = "" if best is None else f"best: trial {best} with {format_score(scores[best])}"
+        summary = "" if best is None else f"best: trial {best} with {format_score(self._outcomes[best])}"
         description = f"{self._over} of {len(self._trials)} trials"
         self._bars.update(self._bar, completed=sum(self._done.values()), description=description, best=summary)
 
 
-def format_settings(settings: Settings) -> str:
-    """Format the settings of a trial: `lr 0.001, hidden [64, 64]`."""
-    return ", ".join(f"{name} {value}" for name, value in settings.items())
-
-
-def format_score(score: float | None) -> str:
-    """Format a score."""
-    return "no score" if score is None else f"{score:+.3f}"
+def format_score(outcome: TrialOutcome) -> str:
+    """Format the score of a trial, with its interval if there is one."""
+    if outcome.score is None:
+        return "no score"
+    if outcome.low is None or outcome.high is None:
+        return f"{outcome.score:+.3f}"
+    return f"{outcome.score:.1%} [{outcome.low:.1%}, {outcome.high:.1%}]"
 
 
 TRIAL = "trial"
 NUMBER = "number"
 SCORE_REPORTS = 5
-"""Number of last reports whose mean is a trial's score: a single one is noisy."""
+"""Number of last reports whose mean is a trial's score: a single one is noisy. Of strength, only the last one counts,
+which has an interval."""
 
 
 class SweepTrial(Trial):
     """A Trial that keeps its newest checkpoint only, and repeats the metric's last value, since schedulers require one.
 
-    config: `trial`, its number and settings. plans: number → configuration of the Trial.
+    config: `trial`, its number and settings. plans: number → configuration of the Trial. strength: how its strength is
+    measured at each checkpoint, if that is the metric.
     """
 
     def setup(  # type: ignore[override]  # Tune's with_parameters passes the others
-        self, config: dict[str, Any], plans: Mapping[int, dict[str, Any]], metric: str
+        self, config: dict[str, Any], plans: Mapping[int, dict[str, Any]], metric: str, strength: StrengthTest | None
     ) -> None:
         super().setup(plans[config[TRIAL][NUMBER]])
         self._metric = metric
+        self._strength = strength
+        self._games = None if strength is None else strength.open_games(self.plan.storage)
+        self._checkpoint = self.plan.start.checkpoint
         self._newest: dict[str, Any] = {}
 
     def step(self) -> dict[str, Any]:
         metrics = super().step()
+        is_stopped = metrics["done"] and not metrics["spent"]
+        if not is_stopped and ("checkpoint" in metrics or (metrics["spent"] and not self._newest)):
+            metrics |= self._measured(is_last=metrics["spent"])
         if self._metric in metrics:
-            self._newest = {self._metric: metrics[self._metric]}
+            self._newest = {name: metrics[name] for name in (self._metric, LOW, HIGH) if name in metrics}
         return self._newest | metrics
 
+    def cleanup(self) -> None:
+        if self._games is not None:
+            self._games.close()
+        super().cleanup()
+
+    def _measured(self, is_last: bool) -> dict[str, float]:
+        """Return the strength of the newest checkpoint. A failure ends a trial only if this is its last checkpoint."""
+        if self._strength is None or self._games is None or self._checkpoint is None:
+            return {}
+        try:
+            checkpoint = self.files.fetch(self._checkpoint)
+            return trial_strength(checkpoint, self.league, self.interface, self._strength.opponents, self._games)
+        except LeagueError:
+            if is_last:
+                raise
+            return {}
+
     def _save(self) -> Path:
-        newest = super()._save()
-        self.files.keep_only(newest)
-        return newest
+        self._checkpoint = super()._save()
+        self.files.keep_only(self._checkpoint)
+        return self._checkpoint
 
 
 class SweepCallback(NotPickled, tune.Callback):
@@ -103,7 +129,8 @@ class SweepCallback(NotPickled, tune.Callback):
         self._sweep = sweep
         self._metric = metric
         self._progress = progress
-        self._scores: dict[int, deque[float]] = defaultdict(lambda: deque(maxlen=SCORE_REPORTS))
+        reports = 1 if metric == STRENGTH else SCORE_REPORTS
+        self._scores: dict[int, deque[float]] = defaultdict(lambda: deque(maxlen=reports))
         self._running: set[int] = set()
         self._awaited: set[int] | None = None
 
@@ -128,7 +155,12 @@ class SweepCallback(NotPickled, tune.Callback):
         scores = self._scores[number]
         score = sum(scores) / len(scores) if scores else None
         outcome = TrialOutcome(
-            score=score, steps=result["steps"], seconds=result["seconds"], ended_early=not result["spent"]
+            score=score,
+            low=result.get(LOW),
+            high=result.get(HIGH),
+            steps=result["steps"],
+            seconds=result["seconds"],
+            ended_early=not result["spent"],
         )
         training = self._sweep.league(number).training
         self._progress.update(number, outcome, training.budget_spent(outcome.steps, outcome.seconds))

@@ -5,13 +5,24 @@ again. They are kept here to show the progress of the run.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 from sqlalchemy import select
 
 from league.registry import leagues
 from league.registry.storage.database import Repository, insert
 from league.registry.storage.rows import StrengthRow
+
+
+@dataclass(frozen=True, slots=True)
+class StrengthScore:
+    """The mean score in [0, 1] of `games` games against an opponent, with the bounds of its 95 % interval."""
+
+    opponent: str
+    games: int
+    score: float
+    low: float
+    high: float
 
 
 class StrengthRepository(Repository):

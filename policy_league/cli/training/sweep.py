@@ -1,47 +1,29 @@
 """`league sweep`."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from policy_league.cli.interrupt import INTERRUPTED, exit_on_interrupt
 from policy_league.cli.options import Config, open_registry
 from policy_league.cli.output import console, say, table
-from policy_league.cli.training.options import (
-    Address,
-    Cpus,
-    Dashboard,
-    Gpus,
-    Minutes,
-    ObjectStore,
-    Runners,
-    Seed,
-    Steps,
-    load_config,
-    without_none,
-)
+from policy_league.cli.training.options import TrainingOptions, with_training_options
 from policy_league.configs.bundled import find
 
 if TYPE_CHECKING:
-    from training.sweeps.sweep import SweepReport
+    from training.sweeps.sweep import SweepReport, TrialReport
 
 
+@with_training_options
 def sweep(
     config: Config,
+    *,
+    options: TrainingOptions,
     resume: Annotated[bool, typer.Option("--resume", help="Resume an interrupted sweep.")] = False,
     publish: Annotated[bool, typer.Option(help="Publish the last checkpoint of the best trial as a version.")] = True,
     samples: Annotated[
         int | None, typer.Option(min=1, help="Number of samples of the random parameters. Overrides CONFIG.")
     ] = None,
-    address: Address = None,
-    minutes: Minutes = None,
-    steps: Steps = None,
-    seed: Seed = None,
-    runners: Runners = None,
-    gpus: Gpus = None,
-    cpus: Cpus = None,
-    object_store: ObjectStore = None,
-    dashboard: Dashboard = False,
 ) -> None:
     """Train with each combination of settings and report the best.
 
@@ -49,10 +31,10 @@ def sweep(
     best one as YAML. TensorBoard logs are written to LEAGUE_HOME/sweeps. `league sweep CONFIG --resume` continues after
     an interruption.
     """
-    from league.ray_cluster import LocalRay
+    from evaluation.service.strength_process import StrengthProcess
     from training.sweeps.sweep import sweep as run
 
-    league = load_config(config, without_none(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus))
+    league = options.league(config)
     if samples is not None and league.sweep is not None:
         league = league.model_copy(update={"sweep": league.sweep.model_copy(update={"samples": samples})})
     with exit_on_interrupt():
@@ -61,10 +43,11 @@ def sweep(
             registry=open_registry(),
             resume=resume,
             publish_best=publish,
-            address=address,
-            local=LocalRay(cpus, object_store, dashboard),
+            address=options.address,
+            local=options.local,
             config_path=find(config),
             console=console,
+            open_games=StrengthProcess,
         )
     _show(report, config)
     if not report.is_whole:
@@ -77,22 +60,8 @@ def _show(report: "SweepReport", config: str) -> None:
     from training.sweeps.search_space import nested
 
     names = list(report.trials[0].settings)
-    table(
-        ("trial", *names, "score", "steps", "minutes", "note"),
-        [
-            (
-                trial.number,
-                *(str(trial.settings[name]) for name in names),
-                trial.score,
-                None if trial.outcome is None else trial.outcome.steps,
-                None if trial.outcome is None else f"{trial.outcome.seconds / 60:.1f}",
-                _note(trial.error, trial.outcome is None, trial.outcome is not None and trial.outcome.ended_early),
-            )
-            for trial in report.trials
-        ],
-        prose=("note",),
-        optional=("note",),
-    )
+    columns = ("trial", *names, "score", "95 % interval", "steps", "minutes", "note")
+    table(columns, [_row(trial, names) for trial in report.trials], prose=("note",), optional=("95 % interval", "note"))
     say(f"\nPlot the metrics: tensorboard --logdir {report.path}")
     if not report.is_whole:
         say(f"Some trials are incomplete. To continue: league sweep {config} --resume")
@@ -105,7 +74,13 @@ def _show(report: "SweepReport", config: str) -> None:
         say(f"Published as {report.version.ref}.")
 
 
-def _note(error: Exception | None, is_open: bool, ended_early: bool) -> str:
-    if error is not None:
-        return str(error)
-    return "incomplete" if is_open else "ended early" if ended_early else ""
+def _row(trial: "TrialReport", names: list[str]) -> tuple[Any, ...]:
+    from training.sweeps.search_space import format_value
+
+    settings = [format_value(trial.settings[name]) for name in names]
+    note = "" if trial.error is None else str(trial.error)
+    if (outcome := trial.outcome) is None:
+        return (trial.number, *settings, None, None, None, None, note or "incomplete")
+    interval = None if outcome.low is None else f"{outcome.low:.3f} to {outcome.high:.3f}"
+    note = note or ("ended early" if outcome.ended_early else "")
+    return (trial.number, *settings, trial.score, interval, outcome.steps, f"{outcome.seconds / 60:.1f}", note)

@@ -13,19 +13,7 @@ from league.refs import CheckpointRef, of_league
 from policy_league.cli.interrupt import exit_on_interrupt
 from policy_league.cli.options import Config, open_registry
 from policy_league.cli.output import console, say
-from policy_league.cli.training.options import (
-    Address,
-    Cpus,
-    Dashboard,
-    Gpus,
-    Minutes,
-    ObjectStore,
-    Runners,
-    Seed,
-    Steps,
-    load_config,
-    without_none,
-)
+from policy_league.cli.training.options import TrainingOptions, with_training_options, without_none
 from policy_league.configs.bundled import find
 
 if TYPE_CHECKING:
@@ -56,22 +44,16 @@ Against = Annotated[
 ]
 
 
+@with_training_options
 def train(
     config: Config,
+    *,
+    options: TrainingOptions,
     parent: Parent = None,
     role: RoleName = "main",
     against: Against = None,
     resume: Resume = False,
-    address: Address = None,
     job: Job = False,
-    minutes: Minutes = None,
-    steps: Steps = None,
-    seed: Seed = None,
-    runners: Runners = None,
-    gpus: Gpus = None,
-    cpus: Cpus = None,
-    object_store: ObjectStore = None,
-    dashboard: Dashboard = False,
 ) -> None:
     """Train a league's policies and publish versions.
 
@@ -87,16 +69,12 @@ def train(
 
     Next step: `league nightly CONFIG` finds the strongest version and promotes it.
     """
-    settings = without_none(minutes=minutes, steps=steps, seed=seed, runners=runners, gpus=gpus)
-    league = load_config(config, settings)
+    league = options.league(config)
     if job:
-        options = without_none(
-            **{"from": parent, "role": None if role == "main" else role}, against=against, **settings
-        )
-        _submit(address, find(config), options, resume, (cpus, object_store, dashboard))
+        run_options = without_none(**{"from": parent, "role": None if role == "main" else role}, against=against)
+        _submit(find(config), run_options, resume, options)
         return
     from evaluation.service.strength_process import StrengthProcess
-    from league.ray_cluster import LocalRay
     from training.runs.train import train as run
 
     registry = open_registry()
@@ -108,8 +86,8 @@ def train(
             role=role,
             target=_version(against, league),
             resume=resume,
-            address=address,
-            local=LocalRay(cpus, object_store, dashboard),
+            address=options.address,
+            local=options.local,
             config_path=find(config),
             console=console,
             measure=measure,
@@ -128,30 +106,20 @@ def next_step(config: str, version: "VersionRow") -> str:
     return f"league exploitability {version.exploits}   (play its exploiters against it)"
 
 
-def _show_token() -> None:
-    """Let Ray send the user's token to the dashboard. Ray 2.60 reads this setting when it is imported."""
+def _submit(config: Path, run_options: dict[str, object], resume: bool, options: TrainingOptions) -> None:
+    # Let Ray send the user's token to the dashboard. Ray 2.60 reads this setting when it is imported.
     if os.environ.keys() & TOKENS or Path("~/.ray/auth_token").expanduser().exists():
         os.environ.setdefault("RAY_AUTH_MODE", "token")
-
-
-def _submit(
-    address: str | None,
-    config: Path,
-    options: dict[str, object],
-    resume: bool,
-    local: tuple[int | None, int | None, bool],
-) -> None:
-    _show_token()
-    from league.ray_cluster import LocalRay, check_unlimited
+    from league.ray_cluster import check_unlimited
     from league.settings import Storage
     from training.runs.job_submission import submit
 
-    if address is None:
+    if options.address is None:
         raise ConfigError("--job requires --address http://HOST:8265, the URL of the cluster's dashboard")
-    check_unlimited(LocalRay(*local))
-    arguments = [f"--{name}={value}" for name, value in options.items()] + ["--resume"] * resume
+    check_unlimited(options.local)
+    arguments = [f"--{name}={value}" for name, value in (run_options | options.settings).items()]
     with exit_on_interrupt():
-        submit(address, config, arguments, Storage.from_environment(), say)
+        submit(options.address, config, arguments + ["--resume"] * resume, Storage.from_environment(), say)
 
 
 def _version(ref: str | None, league: "LeagueConfig") -> CheckpointRef | None:

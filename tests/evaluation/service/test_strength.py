@@ -1,14 +1,17 @@
 """Strength during training: who plays a new version, with which seeds, and what the scores say."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from evaluation.matches.worker import MatchWorker
 from evaluation.service import strength
-from evaluation.service.strength import measure_strength, strength_opponents
+from evaluation.service.strength import measure_export, measure_strength, opponents_of
+from league.policies.loading import strength_opponents
 from league.registry.registry import Registry
+from league.registry.storage.exports import export_version
 from league.results.ledger import Ledger
 from tests.support.leagues import tictactoe
 
@@ -26,7 +29,7 @@ def registry(tmp_path: Path) -> Iterator[Registry]:
 
 
 def opponents(registry: Registry, number: int) -> list[str]:
-    return strength_opponents(registry, registry.versions.get(tictactoe.LEAGUE, number))
+    return opponents_of(registry, registry.versions.get(tictactoe.LEAGUE, number))
 
 
 def promote(registry: Registry, number: int) -> None:
@@ -50,6 +53,27 @@ def test_the_opponents_are_the_champion_and_an_anchor(registry: Registry) -> Non
     configure(registry, "@1", "@staging", "script:one_ply")
     assert opponents(registry, 3) == ["tictactoe@1", "script:one_ply"], "the champion and missing aliases are no anchor"
     assert opponents(registry, 1) == ["script:one_ply"]
+
+
+def test_trials_play_the_champion_and_all_anchors(registry: Registry) -> None:
+    promote(registry, 1)
+    configure(registry, "@1", "@2", "script:one_ply", "@2", "@staging")
+    config = registry.leagues.get(tictactoe.LEAGUE).config
+    assert strength_opponents(config, registry) == ["tictactoe@1", "tictactoe@2", "script:one_ply"]
+
+
+def test_exported_files_play_as_their_version_does(registry: Registry, tmp_path: Path) -> None:
+    version = registry.versions.get(tictactoe.LEAGUE, 3)
+    export_version(version, registry.artifacts, tmp_path / "files")
+    file = tmp_path / "files" / "manifest.json"
+    file.write_text(version.manifest.model_copy(update={"version": 0}).to_json())
+    promote(registry, 1)
+    opponents = ["tictactoe@1", "script:random"]
+    scores = measure_export(worker(registry), tmp_path / "files", opponents, GAMES)
+    rows = measure_strength(registry, worker(registry), 3, GAMES)
+    assert [asdict(score) for score in scores] == [
+        {name: getattr(row, name) for name in ("opponent", "games", "score", "low", "high")} for row in rows
+    ]
 
 
 def test_an_exploiter_plays_its_target(registry: Registry) -> None:

@@ -59,4 +59,4 @@ def test_an_exception_of_a_policy_is_a_response(registry: Registry, version: Ver
 
     worker = Broken(registry.leagues.get(tictactoe.LEAGUE).config, registry)
     with pytest.raises(LeagueError, match=r"^RuntimeError: no such layer$"):
-        measured(registry, worker, version.number, 4)
+        measured(registry, worker, {"version": version.number, "games": 4})

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from league.config.sweep import SweepConfig
 from league.errors import ConfigError
 from tests.support.leagues.training_leagues import tictactoe
-from training.sweeps.search_space import applied, nested, plan
+from training.sweeps.search_space import applied, format_settings, nested, plan
 
 
 def sweep(parameters: dict[str, Any], samples: int = 1) -> SweepConfig:
@@ -17,7 +17,7 @@ def sweep(parameters: dict[str, Any], samples: int = 1) -> SweepConfig:
 def test_trials_are_all_combinations_with_separate_draws() -> None:
     trials = plan(tictactoe(), sweep({"lr": {"loguniform": [1e-4, 1e-2]}, "clip": [0.1, 0.2], "epochs": [2, 3]}, 2))
     assert [(trial["clip"], trial["epochs"]) for trial in trials] == [
-        (0.1, 2), (0.1, 2), (0.1, 3), (0.1, 3), (0.2, 2), (0.2, 2), (0.2, 3), (0.2, 3),
+        (0.1, 2), (0.2, 2), (0.1, 3), (0.2, 3), (0.1, 2), (0.2, 2), (0.1, 3), (0.2, 3),
     ]  # fmt: skip
     assert len({trial["lr"] for trial in trials}) == 8
     assert [list(trial) for trial in trials] == [["lr", "clip", "epochs"]] * 8, "in the order of the configuration"
@@ -37,12 +37,20 @@ def test_draws_are_within_their_range(seed: int, low: float, factor: float) -> N
         "loguniform": {"loguniform": bounds},
         "randint": {"randint": [3, 5]},
         "choice": {"choice": ["a", "b"]},
+        "quniform": {"quniform": [-1, 1, 0.5]},
+        "lograndint": {"lograndint": [3, 20]},
+        "randn": {"randn": [0, 1]},
+        "value": {"choice": [{"nested": [1, 2]}]},
     }
     for trial in plan(tictactoe(seed=seed), sweep(parameters, samples=4)):
         assert bounds[0] <= trial["uniform"] <= bounds[1]
         assert bounds[0] <= trial["loguniform"] <= bounds[1]
         assert trial["randint"] in (3, 4)
         assert trial["choice"] in ("a", "b")
+        assert trial["quniform"] in (-1, -0.5, 0, 0.5, 1)
+        assert 3 <= trial["lograndint"] < 20
+        assert isinstance(trial["randn"], float)
+        assert trial["value"] == {"nested": [1, 2]}
 
 
 @pytest.mark.parametrize(
@@ -57,6 +65,10 @@ def test_draws_are_within_their_range(seed: int, low: float, factor: float) -> N
         ({"loguniform": [0, 1]}, "0 < low"),
         ({"randint": [0.5, 2]}, "whole numbers"),
         ({"choice": 1}, r"choice: \[value"),
+        ({"choice": []}, r"choice: \[value"),
+        ({"quniform": [0, 1]}, r"\[low, high, step\]"),
+        ({"quniform": [0, 1, 0]}, r"\[low, high, step\]"),
+        ({"quniform": [0, 1, 0.3]}, r"\[low, high, step\] .* not divisible"),
     ],
 )
 def test_invalid_parameters_are_rejected(values: Any, expected: str) -> None:
@@ -88,3 +100,9 @@ def test_nested_settings_are_applied() -> None:
 def test_invalid_settings_are_rejected(settings: dict[str, Any], expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
         applied(tictactoe(), settings)
+
+
+def test_settings_are_shown_with_a_few_digits() -> None:
+    assert format_settings({"lr": 0.00012345678, "hidden": [64, 64], "clip": 0.2}) == (
+        "lr 0.0001235, hidden [64, 64], clip 0.2"
+    )

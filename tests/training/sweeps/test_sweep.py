@@ -13,12 +13,14 @@ import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from evaluation.service.strength_process import StrengthProcess
 from league.config.league import LeagueConfig
 from league.errors import ConfigError, NotFound
 from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.leagues.training_leagues import tictactoe
 from tests.support.waiting import until
+from training.runs.train import train
 from training.sweeps.sweep import sweep
 
 SETTINGS = {"steps": 2048, "train_batch_size": 256, "minibatch_size": 128, "epochs": 2, "checkpoint_every": 256}
@@ -46,11 +48,15 @@ def test_invalid_sweeps_are_rejected_before_training(registry: Registry) -> None
         r"sweep\.metric: unknown metric 'retrun'; expected one of .*shared/return": league(
             {"lr": [1]}, metric="retrun"
         ),
-        r"sweep\.asha\.grace_steps": league({"lr": [1]}, asha={"grace_steps": 10**6}),
+        r"sweep\.asha\.grace_steps": league({"lr": [1]}, metric="return", asha={"grace_steps": 10**6}),
+        r"sweep\.metric: strength is measured by games, for which": league({"lr": [1]}),
     }
     for words, config in rejected.items():
         with pytest.raises(ConfigError, match=words):
             sweep(config, registry=registry)
+    config = league({"lr": [1]}, training={"strength": None})
+    with pytest.raises(ConfigError, match=r"training\.strength, which is null"):
+        sweep(config, registry=registry, open_games=StrengthProcess)
     assert not (registry.storage.home / "sweeps").exists()
 
 
@@ -90,6 +96,37 @@ def test_bad_trials_stop_early_and_the_best_is_published(registry: Registry) -> 
         sweep(config, registry=registry, resume=True)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_trials_of_rivals_are_compared_by_strength(registry: Registry) -> None:
+    """The first trial learns nothing, so that it plays as at random. Both play the champion and the anchor."""
+    settings = {"steps": 8192, "checkpoint_every": 4096, "strength": {"games": 100}}
+    output = io.StringIO()
+    champion = untrained_champion(registry)
+    config = league({"lr": [1e-9, 0.01]}, training=settings)
+    report = sweep(config, registry=registry, console=Console(file=output, width=500), open_games=StrengthProcess)
+    assert f"Strength: mean score against {champion}, script:random." in output.getvalue()
+    assert report.best == report.trials[1]
+    for trial in report.trials:
+        assert trial.outcome is not None
+        assert trial.outcome.score is not None
+        assert trial.outcome.low is not None
+        assert trial.outcome.high is not None
+        assert trial.outcome.low < trial.outcome.score < trial.outcome.high
+        events = EventAccumulator(str(report.path / f"trial-00{trial.number}"))
+        scalars = events.Reload().Tags()["scalars"]
+        assert {"run/strength", "strength/low", "strength/high", "strength/script_random"} <= set(scalars)
+    assert "% [" in output.getvalue()
+
+
+def untrained_champion(registry: Registry) -> str:
+    """Train a champion for one update, in which it learns nothing. Returns its reference."""
+    settings = SETTINGS | {"steps": 256, "lr": 1e-9}
+    (version,) = train(tictactoe(**settings), registry=registry, console=Console(quiet=True))
+    registry.aliases.set("tictactoe", "champion", version.number, expected=None, actor="test", reason="first")
+    return version.ref
+
+
 SCRIPT = """
 import sys
 from league.registry.registry import Registry
@@ -114,8 +151,9 @@ def test_a_killed_sweep_continues_with_its_unfinished_trials(registry: Registry)
         driver.wait()
     (outcome,) = home.rglob("outcome.json")
     before = outcome.stat().st_mtime_ns
+    shorter = league({"steps": [256]}, training={"epochs": 32, "minibatch_size": 32}, metric="shared/length")
     with pytest.raises(ConfigError, match="sweep has changed"):
-        sweep(league({"steps": [256]}, training={"epochs": 32, "minibatch_size": 32}), registry=registry, resume=True)
+        sweep(shorter, registry=registry, resume=True)
     shown = io.StringIO()
     report = sweep(LONG, registry=registry, resume=True, publish_best=False, console=Console(file=shown))
     assert outcome.stat().st_mtime_ns == before, "a finished trial is not repeated"
