@@ -45,12 +45,14 @@ STACK = [
 
 @dataclass(frozen=True)
 class Case:
-    """One environment. stock: steps the unmodified environment endlessly, yielding at each step."""
+    """One environment. stock: steps the unmodified environment endlessly, yielding at each step. fast_seeds: step ours
+    as training with `training.seeds: fast` does."""
 
     config: EnvironmentConfig
     num_envs: int
     stock: Callable[[], Iterator[None]]
     target: float
+    fast_seeds: bool = False
 
 
 def main(quick: Quick = False) -> Iterator[Target]:
@@ -65,7 +67,7 @@ def main(quick: Quick = False) -> Iterator[Target]:
 
 def measure(case: Case, rounds: int, seconds: float) -> dict[str, float]:
     """Steps per second of our and of the unmodified environment."""
-    ours, stock = batched(case.config, case.num_envs), case.stock()
+    ours, stock = batched(case.config, case.num_envs, case.fast_seeds), case.stock()
     measures = {
         "ours": lambda: rate(lambda: next(ours) or case.num_envs, seconds),
         "stock": lambda: rate(lambda: next(stock) or 1, seconds),
@@ -74,9 +76,9 @@ def measure(case: Case, rounds: int, seconds: float) -> dict[str, float]:
     return in_rounds(measures, rounds)
 
 
-def batched(config: EnvironmentConfig, num_envs: int) -> Iterator[None]:
+def batched(config: EnvironmentConfig, num_envs: int, fast_seeds: bool = False) -> Iterator[None]:
     """All environments, one step in each at a time."""
-    env, rng, groups = stepping(config, num_envs), np.random.default_rng(0), groups_of(config)
+    env, rng, groups = stepping(config, num_envs, fast_seeds=fast_seeds), np.random.default_rng(0), groups_of(config)
 
     def next_episodes(envs: Indices) -> Starts:
         return Starts(envs, rng.integers(2**31, size=len(envs)), np.tile(groups, (len(envs), 1)))
@@ -144,10 +146,10 @@ VECTOR_ENVS = 1024
 """Copies of a vectorised environment."""
 
 
-def classic(name: str, module: Any, target: float) -> Case:
+def classic(name: str, module: Any, target: float, fast_seeds: bool = False) -> Case:
     """A game of PettingZoo with masks."""
     config = EnvironmentConfig(entry_point=f"pettingzoo.classic.{name}")
-    return Case(config, VECTOR_ENVS, lambda: aec_loop(module.env()), target)
+    return Case(config, VECTOR_ENVS, lambda: aec_loop(module.env()), target, fast_seeds)
 
 
 def mpe(name: str, module: Any, target: float) -> Case:
@@ -165,6 +167,7 @@ CASES = {
     "connect_four": classic("connect_four_v3", connect_four_v3, 100),
     "tictactoe": classic("tictactoe_v3", tictactoe_v3, 100),
     "leduc_holdem": classic("leduc_holdem_v4", leduc_holdem_v4, 20),
+    "leduc_holdem with fast seeds": classic("leduc_holdem_v4", leduc_holdem_v4, 150, fast_seeds=True),
     "simple_spread": mpe("simple_spread_v3", simple_spread_v3, 100),
     "simple_adversary": mpe("simple_adversary_v3", simple_adversary_v3, 80),
     "simple_tag": mpe("simple_tag_v3", simple_tag_v3, 80),

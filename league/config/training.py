@@ -38,6 +38,9 @@ class TrainingSettings(Part):
     """Whether the algorithm can train against opponents, which exploiters need."""
     seed: int = Field(default=0, ge=0)
     """Seed of the run, from which all random choices are derived."""
+    seeds: Literal["stock", "fast"] = "stock"
+    """How episodes are drawn. stock: with the random numbers of the stock environment, as in matches. fast: by a faster
+    generator of the vectorised environment, with the same distribution; equal runs stay equal."""
     steps: int | None = Field(default=None, ge=1)
     """Number of actions of all agents after which training ends; null: 1,000,000, or unlimited if `minutes` is set."""
     minutes: float | None = Field(default=None, gt=0)

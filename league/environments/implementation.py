@@ -102,15 +102,34 @@ def _if_verified(packages: Sequence[str]) -> Implementation | None:
     return None
 
 
-def stepping(config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, states: bool = False) -> BatchedEnvironment:
-    """Create environments that are stepped together, vectorised if possible. See `stock_stepping`."""
+def stepping(
+    config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, states: bool = False, fast_seeds: bool = False
+) -> BatchedEnvironment:
+    """Create environments that are stepped together, vectorised if possible. See `stock_stepping`.
+
+    fast_seeds: draw episodes as `VectorEnv.use_fast_seeds` says. Raises ConfigError if that is not possible.
+    """
+    if fast_seeds:
+        check_fast_seeds(config)
     choice = implementation(config)
     logger.info("%s: %s", config.entry_point, choice.reason)
     vector = choice.vector
     if vector is None:
         return stock_stepping(config, num_envs, crashes=crashes, states=states)
     make: Callable[[int], VectorEnv] = partial(vector, **config.kwargs)
-    return VectorStepping(config, make, num_envs, crashes, states)
+    return VectorStepping(config, make, num_envs, crashes, states, fast_seeds)
+
+
+def check_fast_seeds(config: EnvironmentConfig) -> None:
+    """Raise ConfigError if an environment cannot draw its episodes as `VectorEnv.use_fast_seeds` says."""
+    choice = implementation(config)
+    if choice.vector is not None:
+        try:
+            choice.vector(1, **config.kwargs).use_fast_seeds()
+            return
+        except NotImplementedError:
+            pass
+    raise ConfigError(f"training.seeds: {config.entry_point} has no fast seeds, expected stock. {choice.reason}")
 
 
 def _if_supported(entry_point: str, config: EnvironmentConfig) -> Implementation:

@@ -32,6 +32,7 @@ class VectorStepping:
 
     If the vectorised environment raises, the episodes in progress are replayed in stock environments. Those that raise
     there have crashed, as in lockstep. All others are replayed in a new vectorised environment, and play continues.
+    Episodes with fast seeds cannot be replayed: then the environment's first exception is reported as a fault.
     """
 
     def __init__(
@@ -41,13 +42,16 @@ class VectorStepping:
         num_envs: int,
         crashes: int = 0,
         states: bool = False,
+        fast_seeds: bool = False,
     ) -> None:
-        """make: number of copies → vectorised environment.
+        """make: number of copies → vectorised environment. fast_seeds: see VectorEnv.use_fast_seeds.
 
         Raises EnvironmentMismatch if it has other agents than the stock environment.
         """
-        self._config, self._make, self._gives_states = config, make, states
+        self._config, self._make, self._gives_states, self._has_fast_seeds = config, make, states, fast_seeds
         self._vector = make(num_envs)
+        if fast_seeds:
+            self._vector.use_fast_seeds()
         self.num_envs = num_envs
         with closing(build(config)) as stock:
             self.agents: tuple[str, ...] = tuple(stock.possible_agents)
@@ -115,6 +119,8 @@ class VectorStepping:
         return seconds
 
     def render(self, env: int, agent: str | None = None) -> NDArray:
+        if self._has_fast_seeds:
+            raise EnvironmentMismatch("the environment cannot be rendered with fast seeds")
         with closing(self._episodes.in_stock(self._config, env, render_mode="rgb_array")) as stock:
             picture = stock.render(agent)
         if picture is None:
@@ -187,8 +193,13 @@ class VectorStepping:
     def _crash(self, envs: Indices, error: Exception, step: StepActions | None = None) -> Indices:
         """Return the environments whose stock environment raises too, in the given step or in the reset.
 
-        Raises its error after too many crashes of an environment, and EnvironmentMismatch if none raises.
+        Raises its error after too many crashes of an environment, and EnvironmentMismatch if none raises, or if
+        episodes have fast seeds.
         """
+        if self._has_fast_seeds:
+            raise EnvironmentMismatch(
+                f"the vectorised environment raised with fast seeds: {one_line(error, with_type=True)}"
+            ) from error
         crashed = []
         for env in envs.tolist():
             self._since, self._busy = perf_counter(), np.array([env])

@@ -107,6 +107,10 @@ class WrappedVectorEnv(VectorEnv):
             actions = change(actions)
         return self._wrapped(self._env.step(env_ids, actions))
 
+    def use_fast_seeds(self) -> None:
+        """See VectorEnv."""
+        self._env.use_fast_seeds()
+
     def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32] | None:
         """See VectorEnv. Wrappers do not change the state."""
         return self._env.state(env_ids)

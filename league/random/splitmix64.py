@@ -18,3 +18,12 @@ def outputs(seeds: NDArray[np.uint64], numbers: NDArray[np.int64]) -> NDArray[np
     mixed = (mixed ^ (mixed >> np.uint64(30))) * FACTORS[0]
     mixed = (mixed ^ (mixed >> np.uint64(27))) * FACTORS[1]
     return mixed ^ (mixed >> np.uint64(31))
+
+
+def integers(numbers: NDArray[np.int64], high: int) -> NDArray[np.int64]:
+    """Return integers from 0 to `high` - 1, one for each number: that output of the generator with seed 0, modulo
+    `high`.
+
+    Of the 2⁶⁴ outputs, ⌊2⁶⁴ / high⌋ or one more give each integer: no probability is further than 2⁻⁶⁴ from 1 / high.
+    """
+    return (outputs(np.zeros(1, np.uint64), numbers) % np.uint64(high)).astype(np.int64)

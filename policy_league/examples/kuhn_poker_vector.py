@@ -7,11 +7,23 @@ from numpy.typing import NDArray
 
 from league.environments.vector.alternation import TurnRows, rows_after_move
 from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.random import pcg64
+from league.random import pcg64, splitmix64
 from policy_league.examples.kuhn_poker import AGENTS, BET, DEALS, FIRST_BET, FIRST_CARD, OBSERVATION_SIZE, PASS
 
 CARDS = np.array(DEALS)
 NO_ACTION = -1
+
+
+def stock_deals(seeds: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the deals of the stock environment, as indices of DEALS, (m,)."""
+    # The first number of `np.random.default_rng(seed).random()`, for all seeds.
+    random = pcg64.uniform(pcg64.outputs(seeds, 1)[0], 0, 1)
+    return (len(DEALS) * random).astype(np.int64)
+
+
+def fast_deals(seeds: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return deals with the same distribution, in a tenth of the time."""
+    return splitmix64.integers(seeds, len(DEALS))
 
 
 class KuhnPokerVector(VectorEnv):
@@ -25,11 +37,13 @@ class KuhnPokerVector(VectorEnv):
         self._moves = np.zeros(num_envs, dtype=np.int64)
         self._last_action = np.zeros(num_envs, dtype=np.int64)
         self._observations = np.zeros((num_envs, 2, OBSERVATION_SIZE), dtype=np.int8)
+        self._deals = stock_deals
+
+    def use_fast_seeds(self) -> None:
+        self._deals = fast_deals
 
     def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
-        # The first number of `np.random.default_rng(seed).random()`, for all seeds.
-        random = pcg64.uniform(pcg64.outputs(seeds, 1)[0], 0, 1)
-        cards = CARDS[(len(DEALS) * random).astype(np.int64)]
+        cards = CARDS[self._deals(seeds)]
         self._cards[env_ids] = cards
         self._moves[env_ids] = 0
         self._last_action[env_ids] = NO_ACTION

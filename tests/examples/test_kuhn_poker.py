@@ -9,6 +9,7 @@ from pettingzoo.test import api_test, seed_test
 
 from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
+from league.random import splitmix64
 from policy_league.examples.kuhn_poker import BET, DEALS, PASS, KuhnPoker, env
 from policy_league.examples.kuhn_poker_vector import KuhnPokerVector
 from tests.support.environments.plans import Plan, assert_equal, last_rows, plans
@@ -71,6 +72,17 @@ def test_all_deals_are_equally_probable() -> None:
     dealt = rows.observations["observation"][:, 2:5].sum(axis=0)
     # Six standard deviations of a binomial distribution.
     assert (abs(dealt - 20_000) < 6 * np.sqrt(60_000 * 2 / 9)).all()
+
+
+def test_fast_deals_have_exactly_the_distribution_of_the_game(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All outcomes of the generator are enumerated: each deal has one."""
+    monkeypatch.setattr(splitmix64, "outputs", lambda _, numbers: numbers.astype(np.uint64))
+    game, copies = KuhnPokerVector(len(DEALS)), np.arange(len(DEALS))
+    game.use_fast_seeds()
+    (first,) = game.reset(copies, copies)
+    (second,) = game.step(copies, np.full(len(DEALS), BET))
+    dealt = [rows.observations["observation"][:, 2:5].argmax(axis=1).tolist() for rows in (first, second)]
+    assert sorted(zip(*dealt, strict=True)) == sorted(DEALS)
 
 
 @given(st.integers(0, 2**31 - 1))

@@ -13,7 +13,7 @@ from league.config.algorithms import AnyTraining
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
 from league.config.training import PhaseConfig, TrainingSettings
-from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation
+from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, check_fast_seeds, implementation
 from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.actions import dist_inputs_size
@@ -90,11 +90,13 @@ def configure(
 ) -> None:
     """Set everything in `config` except the algorithm's own hyperparameters.
 
-    Raises ConfigError if `policies_to_train` or `opponents` do not fit the league.
+    Raises ConfigError if `policies_to_train`, `opponents` or `seeds` do not fit the league.
     """
     settings = league.training
     check_policies_to_train(settings, interface.policy_ids)
     check_opponents(league, interface)
+    if settings.seeds == "fast":
+        check_fast_seeds(league.environment)
     config.environment(
         env_config={
             LEAGUE: league.model_dump(mode="json", by_alias=True),

@@ -82,7 +82,13 @@ class BatchedEnvRunner(RaisingEnvRunner):
         self.stop()
         with self._errors_with_league():
             num_envs, crashes = self.config.num_envs_per_env_runner, self.league.training.crashes
-            self.env = stepping(self.league.environment, num_envs, crashes=crashes, states=self.gives_states)
+            self.env = stepping(
+                self.league.environment,
+                num_envs,
+                crashes=crashes,
+                states=self.gives_states,
+                fast_seeds=self.league.training.seeds == "fast",
+            )
             initial = initial_states(self.module)
             storage = self.config.env_config.get(STORAGE)
             self._chunks = EpisodeRecorder(self.interface, self.env.agents, num_envs)

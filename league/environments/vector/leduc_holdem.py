@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.vector.leduc.deals import deal
+from league.environments.vector.leduc.deals import deal, fast_deal
 from league.environments.vector.leduc.tables import tables
 from league.environments.vector.vector_env import AgentRows, UnsupportedArguments, VectorEnv
 from league.spaces import ACTION_MASK, OBSERVATION
@@ -25,9 +25,13 @@ class LeducHoldem(VectorEnv):
         self.num_envs = num_envs
         self._tables = tables()
         self._situations = np.zeros(num_envs, dtype=np.int64)
+        self._deal = deal
+
+    def use_fast_seeds(self) -> None:
+        self._deal = fast_deal
 
     def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
-        self._situations[env_ids] = self._tables.first[deal(seeds)]
+        self._situations[env_ids] = self._tables.first[self._deal(seeds)]
         return self._rows(env_ids)
 
     def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:

@@ -97,6 +97,18 @@ class VectorEnv(ABC):
             the order in which the stock environment reports them. See `reset`.
         """
 
+    def use_fast_seeds(self) -> None:
+        """Draw the random numbers of all further episodes by a faster generator than the stock environment's.
+
+        Called once, before the first reset, by training with `training.seeds: fast`; never in matches. An episode is
+        still determined by its seed and actions, and has the same distribution as in the stock environment, but it is
+        not the stock environment's episode with this seed. Optional: the method of the base class raises.
+
+        Raises:
+            NotImplementedError: The environment has no such generator.
+        """
+        raise NotImplementedError
+
     def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32] | None:
         """Return the global states of some copies, (m, size) float32; None if the stock environment has none."""
         del env_ids

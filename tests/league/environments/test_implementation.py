@@ -8,6 +8,7 @@ from league.config.environment import EnvironmentConfig
 from league.environments import implementation as choice
 from league.environments.implementation import VECTORISED, implementation, stepping
 from league.environments.lockstep import Lockstep
+from league.environments.stepping import Turn, each_agent_alone
 from league.environments.vector.connect_four import ConnectFour
 from league.environments.vector_stepping import VectorStepping
 from league.errors import ConfigError
@@ -77,3 +78,37 @@ def test_arguments_that_a_vectorised_environment_does_not_have_are_rejected() ->
         entry_point=CONNECT_FOUR, kwargs={"lives": 3}, vector=f"{ConnectFour.__module__}:ConnectFour"
     )
     assert implementation(config).vector is None
+
+
+CLIPPED = [{"clip_reward_v0": {"lower_bound": -1, "upper_bound": 1}}]
+
+
+@pytest.mark.parametrize("wrappers", [[], CLIPPED], ids=["plain", "wrapped"])
+def test_fast_seeds_start_other_episodes(wrappers: list[Any]) -> None:
+    config = EnvironmentConfig.model_validate(
+        {"entry_point": "pettingzoo.classic.leduc_holdem_v4", "wrappers": wrappers}
+    )
+    first, again, stock = (
+        stepping(config, 50, fast_seeds=fast).start(each_agent_alone(range(50), 2)) for fast in (True, True, False)
+    )
+    assert observed(first) == observed(again) != observed(stock)
+
+
+def observed(turn: Turn) -> list[list[int]]:
+    return [batch.observations["observation"].tolist() for batch in turn.batches.values()]
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "reason"),
+    [
+        (CONNECT_FOUR, "It is vectorised by league.environments.vector.connect_four:ConnectFour."),
+        (
+            "pettingzoo.butterfly.pistonball_v6",
+            "It is stepped in lockstep, because it has no vectorised implementation.",
+        ),
+    ],
+)
+def test_an_environment_without_fast_seeds_is_named(entry_point: str, reason: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        stepping(EnvironmentConfig(entry_point=entry_point), 1, fast_seeds=True)
+    assert str(error.value) == f"training.seeds: {entry_point} has no fast seeds, expected stock. {reason}"

@@ -14,6 +14,7 @@ from league.config.environment import EnvironmentConfig
 from league.environments.implementation import implementation, stepping
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Starts, States, Turn
+from league.environments.vector.leduc_holdem import LeducHoldem
 from league.environments.vector.vector_env import AgentRows
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward
 from league.spaces import ACTION_MASK
@@ -163,6 +164,15 @@ def test_an_illegal_action_is_rejected_before_any_step() -> None:
     with pytest.raises(IllegalAction, match="action 3 of agent_1"):
         env.step(actions)
     assert set(env.step(zeros(turn)).batches) == {0, 1}
+
+
+def test_a_fault_with_fast_seeds_is_not_sought_in_the_stock_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    env, turn = started(ENVIRONMENTS["Leduc hold'em"], range(50), 4, crashes=3, fast_seeds=True)
+    with pytest.raises(EnvironmentMismatch, match="cannot be rendered with fast seeds"):
+        env.render(0)
+    monkeypatch.setattr(LeducHoldem, "step", lambda *_: 1 / 0)
+    with pytest.raises(EnvironmentMismatch, match="raised with fast seeds: ZeroDivisionError: division by zero"):
+        env.step(zeros(turn))
 
 
 def test_an_environment_is_rendered_by_the_stock_environment() -> None:

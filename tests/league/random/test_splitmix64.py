@@ -22,6 +22,13 @@ def test_outputs_are_those_of_the_reference() -> None:
     assert found[1, 0] == 0xE220A8397B1DCDAF
 
 
+def test_integers_are_outputs_modulo_their_number() -> None:
+    numbers = np.arange(2000)
+    expected = [output % 240 for output in splitmix64.outputs(np.zeros(1, np.uint64), numbers).tolist()]
+    assert splitmix64.integers(numbers, 240).tolist() == expected
+    assert set(expected) == set(range(240))
+
+
 def test_outputs_do_not_depend_on_the_others() -> None:
     numbers = np.array([4, 0, 2])
     assert splitmix64.outputs(np.full(3, SEED, np.uint64), numbers).tolist() == [EXPECTED[i] for i in (4, 0, 2)]

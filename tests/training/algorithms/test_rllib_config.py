@@ -2,10 +2,13 @@ from typing import Any
 
 import pytest
 
+from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
+from policy_league.configs import bundled
 from tests.support.leagues.training_leagues import counting, tictactoe
 from training.algorithms.rllib_config import check_opponents, check_policies_to_train, learning_policies, num_envs
+from training.runs.train import check
 
 POLICIES = ("a", "b", "c")
 
@@ -67,3 +70,17 @@ def test_opponents_are_not_drawn_by_scores_that_games_do_not_have() -> None:
     check_opponents(counting([3, 4, 5], [1], opponents={"league": {"sampling": "uniform"}}), interface(league))
     two = counting([3, 4], [1], opponents={"league": {"sampling": "pfsp"}})
     check_opponents(two, interface(two))
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
+def test_fast_seeds_need_an_environment_that_has_them(algorithm: str) -> None:
+    league = tictactoe(algorithm=algorithm, seeds="fast")
+    with pytest.raises(ConfigError, match=r"training\.seeds: pettingzoo\.classic\.tictactoe_v3 has no fast seeds"):
+        check(league, interface(league))
+
+
+@pytest.mark.parametrize("name", ["kuhn_poker", "leduc_holdem"])
+def test_bundled_configurations_use_the_fast_seeds_of_their_environments(name: str) -> None:
+    league = LeagueConfig.load(bundled.find(name))
+    assert league.training.seeds == "fast"
+    check(league, interface(league))

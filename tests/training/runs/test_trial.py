@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from league.config.environment import EnvironmentConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.settings import Storage
@@ -55,10 +56,14 @@ def test_training_continues_exactly_from_its_checkpoint(tmp_path: Path, monkeypa
     assert len(set(seeds)) == len(seeds)
 
 
-def trial(directory: Path, start: StartState = FROM_SCRATCH, **training: Any) -> Trial:
+TICTACTOE = "pettingzoo.classic.tictactoe_v3"
+
+
+def trial(directory: Path, start: StartState = FROM_SCRATCH, environment: str = TICTACTOE, **training: Any) -> Trial:
     """A trial in this process with checkpoints below `directory`."""
     ppo_settings = {"train_batch_size": 128, "minibatch_size": 64, "epochs": 1}
     league = tictactoe(**({} if "algorithm" in training else ppo_settings), **training)
+    league = league.model_copy(update={"environment": EnvironmentConfig(entry_point=environment)})
     (directory / "checkpoints").mkdir(parents=True, exist_ok=True)
     plan = TrialPlan(start, directory / "checkpoints", directory / "end", Storage.at(directory))
     interface_ = interface(league)
@@ -136,9 +141,14 @@ def test_checkpoints_are_saved_at_their_interval_with_the_curves(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("ray_session")
-def test_restored_training_equals_uninterrupted_training(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("environment", "seeds"), [(TICTACTOE, "stock"), ("pettingzoo.classic.leduc_holdem_v4", "fast")]
+)
+def test_restored_training_equals_uninterrupted_training(tmp_path: Path, environment: str, seeds: str) -> None:
     """Weights, actions and schedules are identical."""
     settings: dict[str, Any] = {
+        "environment": environment,
+        "seeds": seeds,
         "steps": 768,
         "checkpoint_every": 256,
         "opening_plies": 2,

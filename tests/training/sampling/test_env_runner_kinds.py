@@ -68,6 +68,16 @@ def spread(**training: Any) -> LeagueConfig:
     )
 
 
+def leduc(**training: Any) -> LeagueConfig:
+    return LeagueConfig.from_mapping(
+        {
+            "league": "leduc",
+            "environment": {"entry_point": "pettingzoo.classic.leduc_holdem_v4"},
+            "training": {"runners": 0, "num_envs": 3, "hidden": [8], "seed": 5} | training,
+        }
+    )
+
+
 def runner_of(league: LeagueConfig, storage: Storage | None = None) -> BatchedEnvRunner:
     torch.manual_seed(0)
     return BatchedEnvRunner(algorithm_config(league, interface(league), storage), worker_index=0)
@@ -98,6 +108,7 @@ KINDS = {
         "discrete", {"agents": 2}, {"a": ["player_0"], "b": ["player_1"]}, num_envs=3, shared_encoder=True
     ),
     "rllib": simultaneous(RLLIB_MEETING),
+    "fast seeds": leduc(seeds="fast"),
     "early": simultaneous(MEETING, 3, {"arrives": [0, 1, 0], "leaves": [2, 4, 3], "truncated": [1]}),
 }
 
@@ -142,6 +153,14 @@ def test_runners_reset_at_the_same_step_play_identically(league: LeagueConfig) -
     assert mine == theirs
     second.reset_episodes(5001)
     assert [columns(chunk) for chunk in second.sample(num_timesteps=60)] != mine
+
+
+def test_fast_seeds_change_the_episodes_of_training() -> None:
+    fast, stock = (
+        [columns(chunk) for chunk in runner_of(leduc(seeds=seeds)).sample(num_timesteps=60)]
+        for seeds in ("fast", "stock")
+    )
+    assert fast != stock
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.entry_point.rpartition(".")[2])

@@ -9,6 +9,7 @@ import torch
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
+from league.environments.stepping import BatchedEnvironment
 from league.environments.vector_stepping import VectorStepping
 from training.algorithms.ppo import algorithm_config
 from training.learners.ppo import PPOLearner
@@ -35,6 +36,12 @@ WRAPPERS: dict[str, list[Any]] = {
 pytestmark = pytest.mark.usefixtures("ray_session")
 
 
+def in_lockstep(*args: Any, fast_seeds: bool, **options: Any) -> BatchedEnvironment:
+    """`stepping`, without vectorised environments."""
+    assert not fast_seeds
+    return stock_stepping(*args, **options)
+
+
 def trained(league: LeagueConfig) -> tuple[list[list[EpisodeChunks]], dict[str, Any]]:
     """Three samples with an update after each, and the final weights."""
     config = algorithm_config(league, interface(league))
@@ -47,7 +54,7 @@ def trained(league: LeagueConfig) -> tuple[list[list[EpisodeChunks]], dict[str, 
         runner.module.set_state(learner.module.get_state())
         samples.append(runner.sample_chunks(num_timesteps=120))
         learner.update(training_data=TrainingData(episodes=samples[-1]), num_epochs=1, minibatch_size=32)
-    assert isinstance(runner.env, VectorStepping) == (env_runner.stepping is not stock_stepping)
+    assert isinstance(runner.env, VectorStepping) == (env_runner.stepping is not in_lockstep)
     runner.stop()
     return samples, learner.module.get_state()
 
@@ -69,7 +76,7 @@ def test_samples_and_weights_do_not_depend_on_the_implementation(name: str, monk
     environment = {"entry_point": entry_point, "wrappers": WRAPPERS.get(name, [])}
     league = LeagueConfig.from_mapping({"league": "same", "environment": environment, "training": settings | training})
     vectorised = trained(league)
-    monkeypatch.setattr(env_runner, "stepping", stock_stepping)
+    monkeypatch.setattr(env_runner, "stepping", in_lockstep)
     stock = trained(league)
     for mine, theirs in zip(vectorised[0], stock[0], strict=True):
         assert [chunks.policy for chunks in mine] == [chunks.policy for chunks in theirs]

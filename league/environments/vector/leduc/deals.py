@@ -1,11 +1,13 @@
 """Deals of Leduc hold'em, for many seeds at once."""
 
+from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.vector.leduc.generators import Generators
+from league.random import splitmix64
 
 RANKS = np.array([0, 0, 1, 1, 2, 2])
 """Ranks of the cards in RLCard's unshuffled deck: two jacks, two queens, two kings."""
@@ -37,3 +39,12 @@ def deal(seeds: NDArray[np.int64]) -> Deals:
         decks[rows, drawn], decks[:, last] = decks[:, last], decks[rows, drawn]
     # Cards are dealt from the end of the deck.
     return Deals(generators.integers(1), decks[:, 5], decks[:, 4], decks[:, 3])
+
+
+EQUALLY_PROBABLE = np.array([(small_blind, *cards) for small_blind, cards in product((0, 1), permutations(RANKS, 3))]).T
+"""The small blind with each choice of three cards from the deck, in order: the rows of Deals, (4, 240)."""
+
+
+def fast_deal(seeds: NDArray[np.int64]) -> Deals:
+    """Deal hands with the same distribution as RLCard's, in a hundredth of the time."""
+    return Deals(*EQUALLY_PROBABLE[:, splitmix64.integers(seeds, EQUALLY_PROBABLE.shape[1])])

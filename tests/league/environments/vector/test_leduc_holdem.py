@@ -1,5 +1,5 @@
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import product
 from typing import Any
 
@@ -13,7 +13,7 @@ from league.config.environment import EnvironmentConfig
 from league.environments.vector import leduc_holdem
 from league.environments.vector.equality import Comparison, DifferentialTest, compare
 from league.environments.vector.leduc import deals, rules
-from league.environments.vector.leduc.deals import deal
+from league.environments.vector.leduc.deals import deal, fast_deal
 from league.environments.vector.leduc.generators import Generators
 from league.environments.vector.leduc.rules import CALL, CHECK, FOLD, RAISE, Situation
 from league.environments.vector.leduc.tables import tables
@@ -157,6 +157,21 @@ def test_the_public_card_is_hidden_in_the_first_round() -> None:
         rows = play(seed, actions)
         for features in rows.observations[OBSERVATION]:
             assert np.flatnonzero(features[3:6]).tolist() == public
+
+
+def test_a_hand_with_a_fast_seed_is_the_stock_hand_with_its_deal() -> None:
+    copies, seeds = np.arange(100), 2**31 - 1 - np.arange(100)
+    fast, stock = LeducHoldem(100), LeducHoldem(100)
+    fast.use_fast_seeds()
+    reports = [
+        fast.reset(copies, seeds),
+        stock.reset(copies, np.array([seed_of(*hand) for hand in zip(*fast_deal(seeds), strict=True)])),
+    ]
+    for actions in MOST_CHIPS:
+        for (mine,), (theirs,) in [reports]:
+            np.testing.assert_equal(asdict(mine), asdict(theirs))
+        reports = [env.step(copies, np.full(100, actions)) for env in (fast, stock)]
+    np.testing.assert_array_equal(reports[0][0].rewards, reports[1][0].rewards)
 
 
 @pytest.mark.parametrize("name", ["num_players", "render_mode", "screen_height"])

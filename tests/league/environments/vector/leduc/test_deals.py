@@ -1,8 +1,15 @@
+from collections import Counter
+from math import factorial
+
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 from rlcard.games.leducholdem import Game
 from rlcard.utils import seeding
 
-from league.environments.vector.leduc.deals import deal
+from league.environments.vector.leduc import deals
+from league.environments.vector.leduc.deals import EQUALLY_PROBABLE, Deals, deal, fast_deal
+from league.random import splitmix64
 
 RANKS = "JQK"
 
@@ -27,3 +34,34 @@ def test_a_deal_depends_on_its_own_seed_only() -> None:
     together = np.transpose(deal(seeds))
     assert np.array_equal(together, np.concatenate([np.transpose(deal(seeds[i : i + 1])) for i in seeds]))
     assert np.array_equal(together[::-1], np.transpose(deal(seeds[::-1])))
+
+
+class AllDraws:
+    """Generators whose draws are the digits of their seeds: consecutive seeds have all combinations, once each."""
+
+    def __init__(self, seeds: NDArray[np.int64]) -> None:
+        self._digits = seeds
+
+    def integers(self, highest: int) -> NDArray[np.int64]:
+        self._digits, digit = np.divmod(self._digits, highest + 1)
+        return digit
+
+
+def counts(dealt: Deals) -> Counter[tuple[int, ...]]:
+    return Counter(tuple(hand) for hand in np.transpose(dealt).tolist())
+
+
+def test_fast_deals_have_exactly_the_distribution_of_the_stock_deals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both are enumerated: all shuffles of the deck with each small blind, and all outcomes of the fast generator."""
+    monkeypatch.setattr(deals, "Generators", AllDraws)
+    monkeypatch.setattr(splitmix64, "outputs", lambda _, numbers: numbers.astype(np.uint64))
+    shuffles, outcomes = factorial(6) * 2, EQUALLY_PROBABLE.shape[1]
+    stock, fast = counts(deal(np.arange(shuffles))), counts(fast_deal(np.arange(outcomes)))
+    assert len(fast) == 2 * (3**3 - 3), "three cards of one rank are impossible"
+    assert stock == {hand: count * shuffles // outcomes for hand, count in fast.items()}
+
+
+def test_a_fast_deal_depends_on_its_own_seed_only() -> None:
+    seeds = np.array([5, 0, 2**31 - 1, 7])
+    together = np.transpose(fast_deal(seeds)).tolist()
+    assert together == [np.transpose(fast_deal(seeds[i : i + 1])).tolist()[0] for i in range(4)]
