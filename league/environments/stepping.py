@@ -82,10 +82,10 @@ class Batch:
     def rows(self, rows: NDArray) -> "Batch":
         """Return a batch of some rows."""
         return Batch(
-            self.envs[rows],
-            self.agents[rows],
-            {name: array[rows] for name, array in self.observations.items()},
-            self.rewards[rows],
+            self.envs.take(rows),
+            self.agents.take(rows),
+            {name: array.take(rows, axis=0) for name, array in self.observations.items()},
+            self.rewards.take(rows),
         )
 
 

@@ -1,40 +1,37 @@
 """Vectorised Leduc hold'em with information states: many hands at once, equal to leduc_holdem.py."""
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from league.environments.vector.leduc.rules import Situation
 from league.environments.vector.leduc_holdem import LeducHoldem
-from league.environments.vector.vector_env import AgentRows
-from league.spaces import OBSERVATION
-from policy_league.examples.leduc_holdem import FIRST_PUBLIC_CARD, MOST_ACTIONS, NUM_ACTIONS, ROUNDS
+from policy_league.examples.leduc_holdem import MOST_ACTIONS, NUM_ACTIONS, ROUNDS
+
+
+@dataclass(frozen=True)
+class SituationWithHistory(Situation):
+    """A situation, and the actions of both rounds that led to it."""
+
+    history: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
+
+    def after(self, action: int) -> Self:
+        """See Situation."""
+        first, second = self.history
+        history = ((*first, action), second) if self.round == 0 else (first, (*second, action))
+        return replace(super().after(action), history=history)
+
+    def observation(self, player: int) -> NDArray[np.float32]:
+        """Return the features of Situation and of the actions, (68,)."""
+        actions = np.zeros((ROUNDS, MOST_ACTIONS, NUM_ACTIONS), np.float32)
+        for features, of_round in zip(actions, self.history, strict=True):
+            features[np.arange(len(of_round)), list(of_round)] = 1
+        return np.concatenate([super().observation(player), actions.ravel()])
 
 
 class LeducWithHistoryVector(LeducHoldem):
     """Copies of Leduc hold'em that also report the actions of the hand."""
 
-    def __init__(self, num_envs: int, **arguments: Any) -> None:
-        super().__init__(num_envs, **arguments)
-        self._history = np.zeros((num_envs, ROUNDS, MOST_ACTIONS, NUM_ACTIONS), np.float32)
-        self._played = np.zeros((num_envs, ROUNDS), np.int64)
-        self._round = np.zeros(num_envs, np.int64)
-
-    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
-        self._history[env_ids] = self._played[env_ids] = self._round[env_ids] = 0
-        return super().reset(env_ids, seeds)
-
-    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
-        current = self._round[env_ids]
-        self._history[env_ids, current, self._played[env_ids, current], actions] = 1
-        self._played[env_ids, current] += 1
-        return super().step(env_ids, actions)
-
-    def _rows(self, env_ids: NDArray[np.int64]) -> Sequence[AgentRows]:
-        (rows,) = super()._rows(env_ids)
-        stock, history = rows.observations[OBSERVATION], self._history[rows.envs].reshape(len(rows.envs), -1)
-        self._round[rows.envs] = stock[:, FIRST_PUBLIC_CARD : FIRST_PUBLIC_CARD + 3].any(axis=1)
-        states = np.concatenate([stock, history], axis=1)
-        return (replace(rows, observations={**rows.observations, OBSERVATION: states}),)
+    situation = SituationWithHistory

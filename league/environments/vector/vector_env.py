@@ -45,12 +45,12 @@ class AgentRows:
     def take(self, chosen: NDArray[np.int64]) -> "AgentRows":
         """Return some of the rows, in the given order."""
         return AgentRows(
-            self.envs[chosen],
-            self.agents[chosen],
-            {name: array[chosen] for name, array in self.observations.items()},
-            self.rewards[chosen],
-            self.terminations[chosen],
-            self.truncations[chosen],
+            self.envs.take(chosen),
+            self.agents.take(chosen),
+            {name: array.take(chosen, axis=0) for name, array in self.observations.items()},
+            self.rewards.take(chosen),
+            self.terminations.take(chosen),
+            self.truncations.take(chosen),
         )
 
 

@@ -5,6 +5,7 @@ or else the higher card.
 """
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,12 @@ class Situation:
     agreed: int = 0
     winner: int | None = None
 
+    @classmethod
+    def start(cls, small_blind: int, cards: tuple[int, int, int]) -> Self:
+        """Return the first situation of a hand. The player with the small blind acts first."""
+        chips = (SMALL_BLIND, BIG_BLIND) if small_blind == 0 else (BIG_BLIND, SMALL_BLIND)
+        return cls(cards, small_blind, chips)
+
     @property
     def is_over(self) -> bool:
         return self.winner is not None or self.round == len(RAISES)
@@ -51,7 +58,7 @@ class Situation:
         accept = CHECK if self.chips[0] == self.chips[1] else CALL
         return [accept, FOLD] if self.raises == MAX_RAISES else [accept, FOLD, RAISE]
 
-    def after(self, action: int) -> "Situation":
+    def after(self, action: int) -> Self:
         """Return the situation after a legal action."""
         other = 1 - self.player
         if action == FOLD:
@@ -88,9 +95,3 @@ class Situation:
             return (self.winner,)
         strengths = [(card == self.cards[2], card) for card in self.cards[:2]]
         return tuple(player for player in (0, 1) if strengths[player] == max(strengths))
-
-
-def start(small_blind: int, cards: tuple[int, int, int]) -> Situation:
-    """Return the first situation of a hand. The player with the small blind acts first."""
-    chips = (SMALL_BLIND, BIG_BLIND) if small_blind == 0 else (BIG_BLIND, SMALL_BLIND)
-    return Situation(cards, small_blind, chips)

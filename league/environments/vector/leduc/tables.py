@@ -1,5 +1,6 @@
 """Tables of all situations of Leduc hold'em: what follows each action, and what agents are told."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -7,10 +8,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.vector.leduc.rules import Situation, start
+from league.environments.vector.leduc.rules import Situation
 
 NUM_ACTIONS = 4
 NONE = -1
+Start = Callable[[int, tuple[int, int, int]], Situation]
+"""The player with the small blind, and the cards → the first situation of a hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +26,7 @@ class Tables:
         following: Next situation by situation and legal action, (s, 4) int64.
         rows: Rows in each situation, (s, 2) int64: that of the agent who must act, or the last rows of both.
         agents: (r,) int64.
-        observations: (r, 36) float32.
+        observations: (r, features) float32.
         masks: (r, 4) int8.
         rewards: (r,) float64.
         terminations: (r,) bool.
@@ -40,8 +43,8 @@ class Tables:
 
 
 @cache
-def tables() -> Tables:
-    """Enumerate all situations."""
+def tables(start: Start) -> Tables:
+    """Enumerate all situations that can follow the first ones."""
     first = np.full((2, 3, 3, 3), NONE)
     situations: dict[Situation, int] = {}
     for small_blind, *cards in product(range(2), range(3), range(3), range(3)):

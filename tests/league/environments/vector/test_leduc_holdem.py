@@ -16,7 +16,7 @@ from league.environments.vector.leduc import deals, rules
 from league.environments.vector.leduc.deals import deal, fast_deal
 from league.environments.vector.leduc.generators import Generators
 from league.environments.vector.leduc.rules import CALL, CHECK, FOLD, RAISE, Situation
-from league.environments.vector.leduc.tables import tables
+from league.environments.vector.leduc.tables import Start, tables
 from league.environments.vector.leduc_holdem import LeducHoldem
 from league.environments.vector.vector_env import AgentRows, UnsupportedArguments
 from league.spaces import ACTION_MASK, OBSERVATION
@@ -198,8 +198,8 @@ def test_many_steps() -> None:
 def in_tables(**change: Callable[[NDArray], NDArray]) -> tuple[Any, str, Any]:
     """A fault in some columns of the tables."""
 
-    def faulty() -> Any:
-        correct = tables()
+    def faulty(start: Start) -> Any:
+        correct = tables(start)
         return replace(correct, **{name: fault(getattr(correct, name)) for name, fault in change.items()})
 
     return leduc_holdem, "tables", faulty
@@ -218,8 +218,8 @@ class Shared(LeducHoldem):
 
     buffer = np.zeros((1000, 4), dtype=np.int8)
 
-    def _rows(self, env_ids: NDArray[np.int64]) -> Any:
-        (rows,) = super()._rows(env_ids)
+    def _rows(self, env_ids: NDArray[np.int64], situations: NDArray[np.int64]) -> Any:
+        (rows,) = super()._rows(env_ids, situations)
         shared = self.buffer[: len(rows.envs)]
         shared[:] = rows.observations[ACTION_MASK]
         return (replace(rows, observations=rows.observations | {ACTION_MASK: shared}),)  # type: ignore[operator]
