@@ -3,8 +3,8 @@ all with random legal actions.
 
 The unmodified environment is PettingZoo's `env()` or `parallel_env()`, in PettingZoo's loop; its resets have no seed,
 which saves some work, while each of ours has one. For pistonball it is SuperSuit's stack on the raw parallel
-environment, without the checking wrappers. Rates are environment steps per second (moves, in a turn-based game) on one
-core; the two alternate within a round, and a rate is the median over the rounds.
+environment, without the checking wrappers. Rates are environment steps (moves, in a turn-based game) per second of
+processor time; the two alternate within a round, and a rate is the median over the rounds.
 """
 
 import logging
@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
+from time import process_time
 from typing import Any
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -69,8 +70,8 @@ def measure(case: Case, rounds: int, seconds: float) -> dict[str, float]:
     """Steps per second of our and of the unmodified environment."""
     ours, stock = batched(case.config, case.num_envs, case.fast_seeds), case.stock()
     measures = {
-        "ours": lambda: rate(lambda: next(ours) or case.num_envs, seconds),
-        "stock": lambda: rate(lambda: next(stock) or 1, seconds),
+        "ours": lambda: rate(lambda: next(ours) or case.num_envs, seconds, process_time),
+        "stock": lambda: rate(lambda: next(stock) or 1, seconds, process_time),
     }
     in_rounds(measures, 1)  # a warm-up
     return in_rounds(measures, rounds)
