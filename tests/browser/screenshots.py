@@ -30,7 +30,6 @@ from tests.support.leagues import tictactoe
 from tests.support.leagues.browser_leagues import (
     CONFIGS,
     CONNECT_FOUR,
-    EMPTY,
     answer,
     compute,
     verdict_between_versions,
@@ -42,7 +41,7 @@ IMAGES = Path(__file__).parents[2] / "docs" / "images"
 CONFIG = tictactoe.config(play={"opening_plies": 2, "num_envs": 8})
 SEED = 4
 COLORS = 160
-DESK, PHONE = {"width": 1180, "height": 780}, {"width": 390, "height": 780}
+SIZE = {"width": 1180, "height": 780}
 TRAINED = "tictactoe_ppo"
 L = f"/leagues/{LEAGUE}"
 PLAYED = f"/leagues/{CONNECT_FOUR}/play#opponent=script:one_ply&agent=player_0&seed=3&actions=3,2,4,2"
@@ -56,35 +55,22 @@ class Picture:
     path: str
     text: str
     is_dark: bool = False
-    is_phone: bool = False
 
 
 PICTURES = (
-    Picture("leagues", "/", CONNECT_FOUR),
     Picture("leaderboard", L, "95 % interval"),
-    Picture("leaderboard-dark", L, "95 % interval", is_dark=True),
-    Picture("leaderboard-phone", L, "95 % interval", is_phone=True),
     Picture("payoff", f"{L}/payoff", "always wins"),
     Picture("versions", f"{L}/versions", "became champion"),
-    Picture("verdicts", f"{L}/verdicts", "▲ promote"),
-    Picture("verdict", f"{L}/verdicts/{{verdict}}", "Blocks by result"),
     Picture("verdict-dark", f"{L}/verdicts/{{verdict}}", "Blocks by result", is_dark=True),
-    Picture("history", f"{L}/history", "promoted by the gate"),
-    Picture("traffic", f"{L}/traffic", "of requests"),
-    Picture("matches", f"{L}/matches", r"#\d+"),
     Picture("game", f"{L}/matches/{{verdict}}/0/0#5", "Step 5"),
     Picture("play", PLAYED, "Your turn"),
-    Picture("play-dark", PLAYED, "Your turn", is_dark=True),
-    Picture("play-phone", PLAYED, "Your turn", is_phone=True),
-    Picture("evaluations", f"{L}/evaluations", "New evaluation"),
-    Picture("evaluation-new", f"{L}/evaluations/new", "Contestants: all versions"),
     Picture("run", f"/leagues/{TRAINED}/runs/{{run}}", "entropy"),
 )
 
 
 @contextmanager
 def leagues(home: Path) -> Iterator[Registry]:
-    """Tic-tac-toe with twelve versions and a nightly run for each, and connect four between scripts."""
+    """Tic-tac-toe with fourteen versions and a nightly run for each, a trained league, and connect four."""
     registry = tictactoe.registry(home, play=CONFIG.play.model_dump())
     chance = Random(SEED)
     for wins, blocks, centre in sorted(product((False, True), repeat=3)):
@@ -93,10 +79,8 @@ def leagues(home: Path) -> Iterator[Registry]:
             tictactoe.publish(registry, tictactoe.graph(wins=wins, blocks=blocks, order=tuple(order)))
             nightly(CONFIG, registry=registry)
     evaluate(LEAGUE, registry=registry, blocks=8)
-    for name in (CONNECT_FOUR, EMPTY):
-        config = LeagueConfig.load(CONFIGS / f"{name}.yaml")
-        registry.leagues.register(config, interface(config))
-    evaluate(CONNECT_FOUR, ["script:one_ply", "script:random"], registry=registry, blocks=4)
+    config = LeagueConfig.load(CONFIGS / f"{CONNECT_FOUR}.yaml")
+    registry.leagues.register(config, interface(config))
     registry.traffic.set(LEAGUE, canary=Portion(2, 0.05), shadow=None, actor="release-bot", reason="trial")
     registry.versions.set_note(CheckpointRef(LEAGUE, 11), "takes the centre first", actor="ada")
     _train(registry)
@@ -113,13 +97,7 @@ def _train(registry: Registry) -> None:
 
 def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], directory: Path) -> None:
     """Take one screenshot, with a reduced palette."""
-    size = PHONE if picture.is_phone else DESK
-    page = browser.new_page(
-        viewport=size,
-        color_scheme="dark" if picture.is_dark else "light",
-        device_scale_factor=2 if picture.is_phone else 1,
-        reduced_motion="reduce",
-    )
+    page = browser.new_page(viewport=SIZE, color_scheme="dark" if picture.is_dark else "light", reduced_motion="reduce")
     page.goto(url + picture.path.format(**names))
     expect(page.locator("main")).to_contain_text(re.compile(picture.text), timeout=90_000)
     for unfinished in (".loading", ".plot:not(:has(canvas))", ".screen:not(:has(img))"):
