@@ -19,12 +19,12 @@ from evaluation.matches.acting_versions import NO_MIXTURES, ActingVersions, acti
 from evaluation.matches.game_state import ActionNumbers, AgentGenerators, AgentStates, action_keys
 from evaluation.matches.match_recorder import MatchRecorder
 from evaluation.matches.openings import OpeningMoves
-from evaluation.matches.policy_calls import PolicyFault, Randomness, call_policy
+from evaluation.matches.policy_calls import Randomness, call_policy
 from evaluation.matches.returns import agent_sides
 from evaluation.matches.seating import Roster, Seating
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
 from evaluation.schedules.builders import GamePlans, game_plans
-from league.environments.stepping import Batch, BatchedEnvironment, Indices, Starts, Turn
+from league.environments.stepping import Batch, BatchedEnvironment, Indices, Starts
 from league.errors import EnvironmentMismatch, GameCrashed, GameHung, LeagueError, one_line
 from league.interface import Interface
 from league.policies.policy import Policy
@@ -129,10 +129,14 @@ class _GameLoop:
             forfeited = self._forfeited()
             if len(forfeited):
                 self._environment.abandon(forfeited)
-                actions = _without(turn, actions, forfeited)
+                kept = {group: batch.without(forfeited) for group, batch in turn.batches.items()}
+                actions = {group: actions[group][rows] for group, rows in kept.items() if len(rows)}
             self._end_step()
             turn = self._environment.step(actions)
-            self._settle(turn)
+            for rows in turn.endings:
+                self._returns[rows.envs, rows.agents] += rows.rewards
+            if len(turn.finished):
+                self._end(turn.finished[~self._in_opening(turn.finished)])
             self._begin(np.concatenate([forfeited, turn.finished]))
 
     def check_deadline(self) -> None:
@@ -201,7 +205,13 @@ class _GameLoop:
         """Return a contestant's actions, keep its recurrent states, and note the games that it forfeits."""
         games = self._games[self._running[batch.envs]]
         state = self._states[group].get(batch) if group in self._states else None
-        answer = call_policy(policy, batch, self._spaces[batch.agents[0]], state, self._randomness(group, batch, games))
+        seated = self._seating.policies[group]
+        randomness: Randomness = None
+        if seated.is_script:
+            randomness = self._generators.get(batch, self._plans.seeds[games], self._plans.indices[games])
+        elif seated.samples:
+            randomness = ActionNumbers(self._keys[games, batch.agents], self._steps[batch.envs])
+        answer = call_policy(policy, batch, self._spaces[batch.agents[0]], state, randomness)
         if answer.states is not None:
             if group not in self._states:
                 self._states[group] = AgentStates(*self._returns.shape)
@@ -209,26 +219,14 @@ class _GameLoop:
         for row, fault in answer.faults.items():
             self.recorder.add_fault(int(games[row]), int(batch.agents[row]), fault)
             self._faulty.add(int(batch.envs[row]))
-            self._log_forfeit(ref, fault)
+            if (ref, fault.reason) not in self._logged:  # the first forfeit of a contestant for each reason
+                self._logged.add((ref, fault.reason))
+                logger.warning("%s forfeits a game (%s): %s", ref, fault.reason, fault.detail)
         return answer.actions
 
     @cached_property
     def _keys(self) -> NDArray[np.uint64]:
         return action_keys(self._plans.seeds, self._plans.indices, len(self._agents))
-
-    def _randomness(self, group: int, batch: Batch, games: Indices) -> Randomness:
-        seated = self._seating.policies[group]
-        if seated.is_script:
-            return self._generators.get(batch, self._plans.seeds[games], self._plans.indices[games])
-        if seated.samples:
-            return ActionNumbers(self._keys[games, batch.agents], self._steps[batch.envs])
-        return None
-
-    def _log_forfeit(self, ref: str, fault: PolicyFault) -> None:
-        """Log the first forfeit of a contestant for each reason."""
-        if (ref, fault.reason) not in self._logged:
-            self._logged.add((ref, fault.reason))
-            logger.warning("%s forfeits a game (%s): %s", ref, fault.reason, fault.detail)
 
     def _forfeited(self) -> Indices:
         """Record games that end by forfeit and return their environments."""
@@ -255,12 +253,6 @@ class _GameLoop:
         if len(slow := playing[self._environment.seconds()[playing] > self._max_seconds]):
             raise self._hung(slow[:1])
 
-    def _settle(self, turn: Turn) -> None:
-        for rows in turn.endings:
-            self._returns[rows.envs, rows.agents] += rows.rewards
-        if len(turn.finished):
-            self._end(turn.finished[~self._in_opening(turn.finished)])
-
     def crashed(self, env: int, error: Exception) -> GameCrashed:
         """The error for an environment that raised."""
         return GameCrashed(
@@ -280,12 +272,6 @@ class _GameLoop:
         position, index = int(self._plans.positions[game]), int(self._plans.indices[game])
         players = " and ".join(self._schedule.contestants_at(position))
         return f"a game of {players} (game {index} of match {self._schedule.match_id(position)})"
-
-
-def _without(turn: Turn, actions: Mapping[int, NDArray], envs: Indices) -> dict[int, NDArray]:
-    """The actions of all rows that do not belong to these environments."""
-    kept = {group: batch.without(envs) for group, batch in turn.batches.items()}
-    return {group: actions[group][rows] for group, rows in kept.items() if len(rows)}
 
 
 def _leaf(space: Space) -> Leaf:

@@ -59,7 +59,7 @@ def unique_games(matches: Iterable[Match], contestant: str | None = None) -> int
             identity(match, game)
             for match in matches
             for game in match.games
-            if contestant is None or _took_part(match, game, contestant)
+            if contestant is None or contestant in (match.contestants[number] for number in game.sides)
         }
     )
 
@@ -70,10 +70,6 @@ def identity(match: Match, game: Game) -> bytes:
     return blake2b(
         repr((sorted(match.contestants), game.opening, game.actions, returns)).encode(), digest_size=16
     ).digest()
-
-
-def _took_part(match: Match, game: Game, contestant: str) -> bool:
-    return contestant in (match.contestants[number] for number in game.sides)
 
 
 MIN_UPSET = 0.4

@@ -106,11 +106,9 @@ def rank_contestants(
                 interval=None if rating.low is None or rating.high is None else (rating.low, rating.high),
             )
         )
-    return tuple(sorted(table, key=_rank))
-
-
-def _rank(standing: Standing) -> tuple[bool, float, str]:
-    return standing.rating is None, -(standing.score if standing.rating is None else standing.rating), standing.ref
+    return tuple(
+        sorted(table, key=lambda row: (row.rating is None, -(row.score if row.rating is None else row.rating), row.ref))
+    )
 
 
 MOST_CONTESTANTS = 40

@@ -112,7 +112,11 @@ def _call_rows(policy: Policy, batch: Batch, space: Leaf, state: State | None, r
     faults: dict[int, PolicyFault] = {}
     for row in range(rows):
         row_state = None if state is None else {name: array[[row]] for name, array in state.items()}
-        draws = _of_row(randomness, row)
+        draws: Randomness = None
+        if isinstance(randomness, ActionNumbers):
+            draws = randomness.row(row)
+        elif randomness is not None:
+            draws = [randomness[row]]
         try:
             answer = _call_batch(policy, batch.rows(np.array([row])), space, row_state, draws)
         except (MemoryError, RemoteError):
@@ -129,12 +133,6 @@ def _call_rows(policy: Policy, batch: Batch, space: Leaf, state: State | None, r
     for row, action in row_actions.items():
         actions[row] = action
     return PolicyOutput(actions, states or None, faults)
-
-
-def _of_row(randomness: Randomness, row: int) -> Randomness:
-    if isinstance(randomness, ActionNumbers):
-        return randomness.row(row)
-    return None if randomness is None else [randomness[row]]
 
 
 def _check_form(given: Actions, rows: int, space: Leaf) -> None:

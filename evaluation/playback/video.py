@@ -91,7 +91,11 @@ class FrameComposer:
         self._head(draw, caption)
         top = HEAD + self._picture[1]
         draw.rectangle((0, top, self._size[0], self._size[1]), fill=PANEL)
-        self._labels(draw, top, caption)
+        middle = top + LABELS // 2 + 3
+        draw.text((self._action_at, middle), "action", DIM, _font(11), "lm")
+        draw.text((self._size[0] - MARGIN, middle), "return", DIM, _font(11), "rm")
+        if any(line.action and line.chances for line in caption.lines):
+            draw.text((self._action_at + ACTION, middle), "probabilities", DIM, _font(11), "lm")
         for number, line in enumerate(caption.lines):
             self._line(draw, top + LABELS + ROW * number, line)
         return frame
@@ -102,16 +106,12 @@ class FrameComposer:
         room = right - int(_font(15).getlength(caption.step)) - 2 * MARGIN
         draw.text((MARGIN, HEAD // 2), _cut(caption.title, 15, room), DIM, _font(15), "lm")
 
-    def _labels(self, draw: ImageDraw.ImageDraw, top: int, caption: Caption) -> None:
-        middle, likely = top + LABELS // 2 + 3, [line for line in caption.lines if line.chances]
-        draw.text((self._action_at, middle), "action", DIM, _font(11), "lm")
-        draw.text((self._size[0] - MARGIN, middle), "return", DIM, _font(11), "rm")
-        if any(line.action for line in likely):
-            draw.text((self._action_at + ACTION, middle), "probabilities", DIM, _font(11), "lm")
-
     def _line(self, draw: ImageDraw.ImageDraw, top: int, line: Line) -> None:
         width, middle = self._size[0], top + ROW // 2
-        color = _color(line)
+        color = COLORS[line.color % len(COLORS)]  # of the contestant, or of the agents in the picture
+        with suppress(ValueError):  # a colour that Pillow does not know
+            if line.shade is not None:
+                color = ImageColor.getrgb(line.shade)[:3]
         bright = TEXT if line.acted else DIM
         action_at, value_at = self._action_at, width - MARGIN
         draw.ellipse((MARGIN, middle - 5, MARGIN + 10, middle + 5), color if line.acted else PANEL, color, 2)
@@ -143,14 +143,6 @@ class FrameComposer:
             draw.rectangle((left, middle + 8, right, middle + 10), RULE)
             if (filled := round((right - left) * chance)) > 0:
                 draw.rectangle((left, middle + 8, left + filled, middle + 10), color)
-
-
-def _color(line: Line) -> tuple[int, int, int]:
-    """The colour of the agents in the picture, or one of the contestant."""
-    with suppress(ValueError):  # a colour that Pillow does not know
-        if line.shade is not None:
-            return ImageColor.getrgb(line.shade)[:3]
-    return COLORS[line.color % len(COLORS)]
 
 
 def _fitted(width: int, height: int) -> tuple[int, int]:

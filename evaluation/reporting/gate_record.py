@@ -21,7 +21,11 @@ def why_not_champion(registry: Registry, league: str, leaderboard: Sequence[Stan
     A script, bot or remote model cannot become champion: the explanation is about the best version.
     """
     versions = [
-        standing for standing in leaderboard if standing.rating is not None and _is_version_of(league, standing.ref)
+        standing
+        for standing in leaderboard
+        if standing.rating is not None
+        and isinstance(parsed := parse_ref(standing.ref), CheckpointRef)
+        and parsed.league == league
     ]
     champion = registry.aliases.current(league).get(CHAMPION)
     if not versions or versions[0].ref == f"{league}@{champion}":
@@ -30,11 +34,6 @@ def why_not_champion(registry: Registry, league: str, leaderboard: Sequence[Stan
     holder = "there is no champion" if champion is None else f"the champion is {league}@{champion}"
     finding = gate_record(registry, registry.versions.resolve(CheckpointRef.parse(best.ref)))
     return f"{best.ref} is the best version by rating, but {holder}: {finding}{_overlap(best, leaderboard, champion)}."
-
-
-def _is_version_of(league: str, ref: str) -> bool:
-    parsed = parse_ref(ref)
-    return isinstance(parsed, CheckpointRef) and parsed.league == league
 
 
 def _overlap(best: Standing, leaderboard: Sequence[Standing], champion: int | None) -> str:

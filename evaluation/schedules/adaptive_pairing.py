@@ -72,7 +72,7 @@ def _chosen(points: Floats, games: Floats, number: int, comparisons: int) -> lis
     information = at_once * comparisons * expit(gap) * expit(-gap)
     pairings: list[Pairing] = []
     while len(pairings) < number:
-        covariance = _inverse(precision)
+        covariance = cho_solve(cho_factor(precision), np.eye(len(precision)))
         diagonal = np.diag(covariance)
         variance = diagonal[first] + diagonal[second] - 2 * covariance[first, second]
         gain = information * variance
@@ -115,10 +115,6 @@ def posterior(points: Floats, games: Floats) -> tuple[Floats, Floats]:
 
 TOLERANCE = 1e-6
 """Convergence of the fit, in log odds."""
-
-
-def _inverse(precision: Floats) -> Floats:
-    return np.asarray(cho_solve(cho_factor(precision), np.eye(len(precision))))
 
 
 def _disjoint(value: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Iterator[int]:

@@ -93,7 +93,18 @@ def plan_tournament(
         case "cross_play":
             return _fixed(cross_play(config, interface, contestants, blocks, seed))
         case "adaptive":
-            return _adaptive(config, interface, contestants, blocks, seed)
+            if len(contestants) < 2:
+                raise too_few(config.league, contestants)
+            shortest = next(adaptive_rounds(interface, len(contestants)))
+            return TournamentPlan(
+                name=adaptive_name(config, interface, contestants, seed),
+                contestants=tuple(contestants),
+                next_schedule=lambda matches: adaptive_round(
+                    config, interface, contestants, [match.result() for match in matches], seed
+                ),
+                length=max(shortest, math.ceil(blocks * math.comb(len(contestants), 2) / ADAPTIVE_SHARE)),
+                rounds=lambda: adaptive_rounds(interface, len(contestants)),
+            )
 
 
 def _fixed(schedule: Schedule) -> TournamentPlan:
@@ -104,23 +115,6 @@ def _fixed(schedule: Schedule) -> TournamentPlan:
         next_schedule=lambda matches: None if matches else schedule,
         length=schedule.length,
         rounds=lambda: itertools.count(turn, turn),
-    )
-
-
-def _adaptive(
-    config: LeagueConfig, interface: Interface, contestants: Sequence[str], blocks: int, seed: int
-) -> TournamentPlan:
-    if len(contestants) < 2:
-        raise too_few(config.league, contestants)
-    shortest = next(adaptive_rounds(interface, len(contestants)))
-    return TournamentPlan(
-        name=adaptive_name(config, interface, contestants, seed),
-        contestants=tuple(contestants),
-        next_schedule=lambda matches: adaptive_round(
-            config, interface, contestants, [match.result() for match in matches], seed
-        ),
-        length=max(shortest, math.ceil(blocks * math.comb(len(contestants), 2) / ADAPTIVE_SHARE)),
-        rounds=lambda: adaptive_rounds(interface, len(contestants)),
     )
 
 

@@ -14,8 +14,7 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any, Self
 
 from ray.exceptions import RayError
@@ -137,24 +136,6 @@ class Heartbeat:
             self._stop_requested = row.stop_at is not None
 
 
-@contextmanager
-def _ray_job(options: EvaluationJobOptions) -> Iterator[None]:
-    """Connect to Ray at `options.address` as a job. Everything it starts ends with this process."""
-    with ray_session():
-        if options.address is not None:
-            runtime_env = _task_environment() if options.workers > 1 else None
-            join(options.address, namespace="evaluations", runtime_env=runtime_env)
-        yield
-
-
-def _task_environment() -> dict[str, Any]:
-    """Tasks get the import path and the low priority of this process."""
-    return {
-        "worker_process_setup_hook": "league.subprocesses.lower_priority",
-        "env_vars": {"PYTHONPATH": os.environ.get("PYTHONPATH", "")},
-    }
-
-
 def _release(options: EvaluationJobOptions, registry: Registry) -> None:
     with suppress(LeagueError):
         registry.evaluations.release(options.evaluation, options.runner)
@@ -166,7 +147,14 @@ def main() -> None:
     lower_priority()
     registry = Registry.open(Storage.from_environment(), create=False)
     exit_with_parent(lambda: _release(options, registry))
-    with _ray_job(options):
+    with ray_session():
+        if options.address is not None:
+            # Connect as a job: everything it starts ends with this process. Tasks get its import path and low priority.
+            runtime_env: dict[str, Any] = {
+                "worker_process_setup_hook": "league.subprocesses.lower_priority",
+                "env_vars": {"PYTHONPATH": os.environ.get("PYTHONPATH", "")},
+            }
+            join(options.address, namespace="evaluations", runtime_env=runtime_env if options.workers > 1 else None)
         run_evaluation(options, registry)
 
 

@@ -101,13 +101,11 @@ class EvaluationSupervisor:
             if not job.process.is_running:
                 self._release(job)
                 self._jobs.remove(job)
-            elif self._is_overdue(job.options):
+                continue
+            stop_at = self._registry.evaluations.get(job.options.league, job.options.evaluation).stop_at
+            if stop_at is not None and datetime.now(UTC) - stop_at > STOP_TIMEOUT:
                 logger.error("evaluation %d did not stop in time: killing its process", job.options.evaluation)
                 job.process.kill()
-
-    def _is_overdue(self, options: EvaluationJobOptions) -> bool:
-        stop_at = self._registry.evaluations.get(options.league, options.evaluation).stop_at
-        return stop_at is not None and datetime.now(UTC) - stop_at > STOP_TIMEOUT
 
     def _release(self, job: _Job) -> None:
         if code := job.process.reap():

@@ -78,18 +78,14 @@ class GameWorkerPool:
 
     def _worker(self, league: str) -> _LeagueWorker:
         if league not in self._workers:
-            self._make_room()
+            if len(self._workers) >= self._most:
+                idle = next((other for other, worker in self._workers.items() if not worker.is_busy), None)
+                if idle is None:
+                    raise Overloaded(f"all {self._most} processes for games are in use by other leagues: retry soon")
+                self._workers.pop(idle).close()
             self._workers[league] = _LeagueWorker(league, self._seconds, self._grace)
         self._workers.move_to_end(league)
         return self._workers[league]
-
-    def _make_room(self) -> None:
-        if len(self._workers) < self._most:
-            return
-        idle = next((league for league, worker in self._workers.items() if not worker.is_busy), None)
-        if idle is None:
-            raise Overloaded(f"all {self._most} processes for games are in use by other leagues: retry soon")
-        self._workers.pop(idle).close()
 
     def _evict(self) -> None:
         """Remove the oldest responses beyond the limits of the cache."""

@@ -48,25 +48,14 @@ class SnapshotRefresher:
         while not self._is_closed.wait(max(POLL_INTERVAL, IDLE_FACTOR * worked)):
             began = time.monotonic()
             try:
-                if (league := self._stale()) is not None:
-                    self._refresh(league)
+                stale = self._registry.snapshots.stale()  # the longest first
+                league = next((name for name in stale if began >= self._not_before.get(name, began)), None)
+                if league is not None:
+                    process = Subprocess("evaluation.service.snapshots", league)
+                    process.wait(self._is_closed)
+                    if process.stop() and not self._is_closed.is_set():
+                        logger.error("the subprocess that computes the snapshots of league %s failed", league)
+                        self._not_before[league] = time.monotonic() + RETRY_DELAY
             except LeagueError as error:
                 logger.error("snapshots cannot be refreshed: %s", error)
             worked = time.monotonic() - began
-
-    def _stale(self) -> str | None:
-        """The league whose snapshots have been stale for longest."""
-        current_time = time.monotonic()
-        waiting = (
-            league
-            for league in self._registry.snapshots.stale()
-            if current_time >= self._not_before.get(league, current_time)
-        )
-        return next(waiting, None)
-
-    def _refresh(self, league: str) -> None:
-        process = Subprocess("evaluation.service.snapshots", league)
-        process.wait(self._is_closed)
-        if process.stop() and not self._is_closed.is_set():
-            logger.error("the subprocess that computes the snapshots of league %s failed", league)
-            self._not_before[league] = time.monotonic() + RETRY_DELAY

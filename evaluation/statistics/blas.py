@@ -8,15 +8,12 @@ from functools import cache
 
 from threadpoolctl import ThreadpoolController
 
+controller = cache(ThreadpoolController)
+"""Returns the controller of the loaded libraries. Finding them takes a moment."""
+
 
 @contextmanager
 def single_threaded_blas() -> Iterator[None]:
     """Context manager: the BLAS of NumPy and SciPy uses one thread in this process."""
-    with _controller().limit(limits=1, user_api="blas"):
+    with controller().limit(limits=1, user_api="blas"):
         yield
-
-
-@cache
-def _controller() -> ThreadpoolController:
-    """Controller of the loaded libraries. Finding them takes a moment."""
-    return ThreadpoolController()

@@ -89,7 +89,10 @@ def rate(
     names = sorted({anchor}.union(*(block.contestants for block in blocks)))
     number = {name: i for i, name in enumerate(names)}
     table = _BlockTable.of(blocks, number)
-    rated = _connected(table, len(names), number[anchor])
+    first, second = table.pairs.T
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(names), len(names)))
+    components = connected_components(graph, directed=False)[1]
+    rated = np.asarray(components == components[number[anchor]])
     index = np.cumsum(rated) - 1
     table = table.only(rated[table.pairs[:, 0]], index)
     ratings = dict.fromkeys(names, Rating(None, None, None)) | {anchor: Rating(0.0, 0.0, 0.0)}
@@ -182,13 +185,6 @@ class _BlockTable:
         inverse = cho_solve(_factor(design, games * p * (1 - p)), np.eye(design.shape[1]))
         variance = np.einsum("ij,ij->i", inverse @ _weighted(design, squares), inverse)
         return np.insert(np.sqrt(variance), anchor, 0.0)
-
-
-def _connected(table: _BlockTable, contestants: int, anchor: int) -> NDArray[np.bool_]:
-    first, second = table.pairs.T
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(contestants, contestants))
-    labels = connected_components(graph, directed=False)[1]
-    return np.asarray(labels == labels[anchor])
 
 
 def bradley_terry(points: Floats, games: Floats, pairs: Ints, size: int, anchor: int) -> Floats:

@@ -78,7 +78,11 @@ def stratified_bootstrap(
     """
     matrices = [_scores(matrix) for matrix in scores]
     rng = np.random.default_rng(seed)
-    values = [statistic(*(_redrawn(matrix, rng) for matrix in matrices)) for _ in range(resamples)]
+
+    def resample(matrix: Floats) -> Floats:
+        return np.take_along_axis(matrix, rng.integers(len(matrix), size=matrix.shape), axis=0)
+
+    values = [statistic(*map(resample, matrices)) for _ in range(resamples)]
     tail = _expanded((1 - confidence) / 2, matrices)
     low, high = np.quantile(values, [tail, 1 - tail])
     return BootstrapEstimate(statistic(*matrices), float(low), float(high))
@@ -91,10 +95,6 @@ def _expanded(tail: float, scores: Sequence[Floats]) -> float:
         return 0.0
     freedom = sum(matrix.shape[1] * (len(matrix) - 1) for matrix in scores)
     return float(ndtr(-math.sqrt(fewest / (fewest - 1)) * stdtrit(freedom, 1 - tail)))
-
-
-def _redrawn(scores: Floats, rng: np.random.Generator) -> Floats:
-    return np.take_along_axis(scores, rng.integers(len(scores), size=scores.shape), axis=0)
 
 
 def _scores(scores: ArrayLike) -> Floats:

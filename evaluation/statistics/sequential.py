@@ -277,7 +277,11 @@ def gsprt_llr(counts: ArrayLike, elo0: float, elo1: float, model: Model) -> Floa
             ±197 for pairs (see LARGEST_EFFECT).
     """
     cells = _cells(counts)
-    _check_hypotheses(elo0, elo1, model, _games(cells.shape[-1]))
+    if not elo0 < elo1:
+        raise ValueError(f"elo0 must be below elo1, not {elo0} and {elo1}")
+    limit = LARGEST_EFFECT * ELO_PER_EFFECT / math.sqrt(_games(cells.shape[-1]))
+    if model == "normalized" and max(abs(elo0), abs(elo1)) > limit:
+        raise ValueError(f"normalized elo0 and elo1 must lie within ±{limit:.0f}, not {elo0} and {elo1}")
     total = cells.sum(axis=-1)
     rows, inverse = np.unique(cells.reshape(-1, cells.shape[-1]), axis=0, return_inverse=True)
     observed = np.maximum(rows, EMPTY_CELL)
@@ -368,14 +372,6 @@ def expected_games(elo0: float, elo1: float, elo: float, alpha: float, beta: flo
         return -lower * upper / variance
     p_upper = math.expm1(-slope * lower) / (math.exp(-slope * lower) - math.exp(-slope * upper))
     return (p_upper * upper + (1 - p_upper) * lower) / drift
-
-
-def _check_hypotheses(elo0: float, elo1: float, model: Model, games: int) -> None:
-    if not elo0 < elo1:
-        raise ValueError(f"elo0 must be below elo1, not {elo0} and {elo1}")
-    limit = LARGEST_EFFECT * ELO_PER_EFFECT / math.sqrt(games)
-    if model == "normalized" and max(abs(elo0), abs(elo1)) > limit:
-        raise ValueError(f"normalized elo0 and elo1 must lie within ±{limit:.0f}, not {elo0} and {elo1}")
 
 
 def _cells(counts: ArrayLike) -> Floats:

@@ -39,6 +39,7 @@ def demo(
     The results are stored in LEAGUE_HOME and can be used with all other commands.
     """
     from league.config.league import LeagueConfig
+    from policy_league.cli.evaluation.nightly import run_nightly
     from serve_app.runtime.launch import running
 
     storage = Storage.from_environment()
@@ -47,7 +48,9 @@ def demo(
     say("Policy League demo: Connect Four, from self-play training to a champion served over HTTP.")
     say(f"Data is stored in {storage.home}.")
     _train(config, minutes)
-    _evaluate(config)
+    _step(2, "Evaluate: each new version plays the champion in pairs of games with sides swapped.")
+    say("A sequential test (GSPRT) decides when to stop: promote, reject or undecided.")
+    run_nightly(config, workers=0)
     _step(3, f"Serve: Ray Serve and HAProxy serve the champion on 127.0.0.1:{port}.")
     with running(storage, port=port, grpc_port=grpc_port) as url:
         _play(config, url)
@@ -56,7 +59,10 @@ def demo(
         else:
             _show_next_steps(config.league, url)
             say("Serving until Ctrl-C.")
-            _wait_for_interrupt()
+            stop = threading.Event()
+            for name in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(name, lambda *_: stop.set())
+            stop.wait()
             say("\nStopping.")
 
 
@@ -71,14 +77,6 @@ def _train(config: "LeagueConfig", minutes: float) -> None:
     registry = open_registry()
     with closing(StrengthProcess(registry.storage)) as measure:
         train(paced, registry=registry, config_path=find(LEAGUE), console=console, measure=measure)
-
-
-def _evaluate(config: "LeagueConfig") -> None:
-    from policy_league.cli.evaluation.nightly import run_nightly
-
-    _step(2, "Evaluate: each new version plays the champion in pairs of games with sides swapped.")
-    say("A sequential test (GSPRT) decides when to stop: promote, reject or undecided.")
-    run_nightly(config, workers=0)
 
 
 def _play(config: "LeagueConfig", url: str) -> None:
@@ -142,10 +140,3 @@ def _step(number: int, sentence: str) -> None:
     say("")
     console.print(Rule(f"Step {number} of 4", align="left"))
     say(sentence)
-
-
-def _wait_for_interrupt() -> None:
-    stop = threading.Event()
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, lambda *_: stop.set())
-    stop.wait()

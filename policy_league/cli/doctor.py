@@ -201,15 +201,11 @@ def _ports() -> Iterator[Check]:
     for name, section, option in (("HTTP", "http_options", "--port"), ("gRPC", "grpc_options", "--grpc-port")):
         if section in document:
             port = document[section]["port"]
-            is_taken = _is_taken(port)
+            with socket.socket() as probe:
+                is_taken = probe.connect_ex(("127.0.0.1", port)) == 0
             port_state = f"port {port} is {'in use' if is_taken else 'free'}"
             advice = f"unless this is your policy server, use `league serve {option} PORT`" if is_taken else ""
             yield Check(f"serving {name}", "note" if is_taken else "ok", port_state, advice)
-
-
-def _is_taken(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 CHECKS: tuple[Callable[[], Iterator[Check]], ...] = (

@@ -4,7 +4,6 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NoReturn
 
 import typer
 
@@ -21,14 +20,10 @@ def exit_on_interrupt() -> Iterator[None]:
         yield
     except KeyboardInterrupt as end:
         if not str(end):
-            _exit_at_once()
+            # Python would end a publishing thread by force, which Ray's handlers report as a crash. --resume publishes
+            # the version.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(INTERRUPTED)
         say(f"\n{end}")
         raise typer.Exit(INTERRUPTED) from end
-
-
-def _exit_at_once() -> NoReturn:
-    """Exit without stopping threads. Python would end a publishing thread by force, which Ray's handlers report as a
-    crash. --resume publishes the version."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(INTERRUPTED)

@@ -159,7 +159,9 @@ def _league() -> None:
 
 def run() -> None:
     """Run the command. A LeagueError becomes one line on stderr and exit code 2 (invalid input) or 1."""
-    _add_working_directory_to_path()
+    # A league's `entry_point` may name a module in the working directory. Ray passes the path on to its workers. It is
+    # the last one, so that its files do not shadow installed packages.
+    sys.path.append(os.getcwd())
     try:
         if "--json" in sys.argv:
             from policy_league.cli.output import only_json_on_stdout
@@ -177,11 +179,3 @@ def run() -> None:
         if end.code == signal.SIGTERM:  # Ray's handler exits with the number of the signal.
             sys.exit(TERMINATED)
         raise
-
-
-def _add_working_directory_to_path() -> None:
-    """Let a league's `entry_point` name a module in the working directory. Ray passes the path on to its workers.
-
-    The directory is appended so that its files do not shadow installed packages.
-    """
-    sys.path.append(os.getcwd())

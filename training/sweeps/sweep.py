@@ -114,7 +114,9 @@ def sweep(
     silence_tune()
     interface = interface_of(config)
     trials = plan(config, config.sweep)
-    config = config.model_copy(update={"sweep": _with_metric(config.sweep, interface)})
+    if config.sweep.metric == "auto":
+        metric = STRENGTH if len(interface.sides) > 1 else metrics.RETURN
+        config = config.model_copy(update={"sweep": config.sweep.model_copy(update={"metric": metric})})
     assert config.sweep is not None
     _check(config, config.sweep, trials, interface, can_play=open_games is not None)
     check_contestants(config, interface, registry)
@@ -165,12 +167,6 @@ def _conclude(
             version = _publish(sweep, best.number, interface, registry)
         sweep.complete()
     return SweepReport(sweep.path, trials, best, version, is_whole)
-
-
-def _with_metric(sweep: SweepConfig, interface: Interface) -> SweepConfig:
-    """Return the sweep with the metric that `auto` stands for."""
-    metric = STRENGTH if len(interface.sides) > 1 else metrics.RETURN
-    return sweep.model_copy(update={"metric": metric}) if sweep.metric == "auto" else sweep
 
 
 def _check(

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from enum import Enum
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,7 +20,7 @@ from policy_league.cli.options import (
 from policy_league.cli.output import GameProgress, complain, emit, say, show_leaderboard, table
 
 if TYPE_CHECKING:
-    from evaluation.documents import CrossPlay, Estimate, EvaluationReport, Population
+    from evaluation.documents import Estimate, EvaluationReport
     from league.registry.registry import Registry
 
 
@@ -116,7 +116,10 @@ def _show(report: "EvaluationReport", registry: "Registry") -> None:
     end = "" if report.stopped_by == "schedule" else f"; stopped by --{report.stopped_by}"
     say(f"{report.league}: {report.games} games, {report.unique_games} unique{end}\n")
     if report.cross_play is not None:
-        _show_cross_play(report.cross_play)
+        cross = report.cross_play
+        say("Mean return of the team [95 %]: the row plays one agent (each in turn), the column plays all others:")
+        _show_matrix(cross.contestants, [[_span(cell) for cell in row] for row in cross.returns])
+        say(f"\nSelf-play {_span(cross.own) or '–'}, cross-play {_span(cross.mixed) or '–'}.")
         return
     show_leaderboard(report.leaderboard, why_not_champion(registry, report.league, report.leaderboard))
     for side, leaderboard in report.by_side.items():
@@ -126,26 +129,26 @@ def _show(report: "EvaluationReport", registry: "Registry") -> None:
     for ref, lost in report.forfeits.items():
         complain(f"{ref} forfeited {lost}")
     if report.population is not None:
-        _show_population(report.payoff.contestants, report.population)
+        say("\nα-Rank and Nash equilibrium shares [95 %]:")
+        shares = map(_share, report.population.alpha_rank), map(_share, report.population.nash)
+        table(("contestant", "α-Rank", "Nash"), zip(report.payoff.contestants, *shares, strict=True))
 
 
 def _show_payoff(report: "EvaluationReport") -> None:
     payoff = report.payoff
     say(f"\nVersions played with {report.actions} actions.")
-    names = [_short(ref) for ref in payoff.contestants]
     compared = "" if report.scoring == "game" else ", compared on the same side and seed"
     say(f"\nPayoff matrix: score of the row against the column{compared} (1: wins every game, 0.5: even):")
-    table(("", *names), [(name, *row) for name, row in zip(names, payoff.score, strict=True)])
+    _show_matrix(payoff.contestants, payoff.score)
     if report.scoring == "side":
         say("\nMean return of the row minus mean return of the column in the same blocks [95 %]:")
-        cells = [[None if gap is None else str(gap) for gap in row] for row in payoff.difference]
-        table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
+        gaps = [[None if gap is None else str(gap) for gap in row] for row in payoff.difference]
+        _show_matrix(payoff.contestants, gaps)
 
 
-def _show_population(contestants: Sequence[str], shares: "Population") -> None:
-    say("\nα-Rank and Nash equilibrium shares [95 %]:")
-    rows = zip(contestants, map(_share, shares.alpha_rank), map(_share, shares.nash), strict=True)
-    table(("contestant", "α-Rank", "Nash"), rows)
+def _show_matrix(contestants: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
+    names = [ref.rpartition("@")[2] if "@" in ref else ref for ref in contestants]
+    table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
 
 
 def _share(estimate: "Estimate") -> str:
@@ -154,21 +157,9 @@ def _share(estimate: "Estimate") -> str:
     return f"{estimate.value:.3f}{bounds}"
 
 
-def _show_cross_play(cross: "CrossPlay") -> None:
-    say("Mean return of the team [95 %]: the row plays one agent (each in turn), the column plays all others:")
-    names = [_short(ref) for ref in cross.contestants]
-    cells = [[_span(cell) for cell in row] for row in cross.returns]
-    table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
-    say(f"\nSelf-play {_span(cross.own) or '–'}, cross-play {_span(cross.mixed) or '–'}.")
-
-
 def _span(estimate: "Estimate | None") -> str | None:
     """`-21.5 [-22.1, -20.9]`"""
     if estimate is None:
         return None
     bounds = "" if estimate.low is None or estimate.high is None else f" [{estimate.low:.4g}, {estimate.high:.4g}]"
     return f"{estimate.value:.4g}{bounds}"
-
-
-def _short(ref: str) -> str:
-    return ref.rpartition("@")[2] if "@" in ref else ref

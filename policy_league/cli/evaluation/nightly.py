@@ -26,7 +26,6 @@ from policy_league.cli.output import GameProgress, complain, console, emit, say,
 from policy_league.configs.bundled import find, names
 
 if TYPE_CHECKING:
-    from evaluation.gating.evidence import Confirmation
     from evaluation.gating.nightly import NightlyReport
     from evaluation.gating.trained_exploiters import Trainer
     from league.config.league import LeagueConfig
@@ -311,7 +310,16 @@ def night_document(night: "TrainingNightRow") -> dict[str, Any]:
 
 def summary_of(report: "NightlyReport") -> list[str]:
     """Summarise a nightly run in one sentence per league and confirmed promotion."""
-    return [f"{report.league}: {_change(report)}", *(_gain(gain) for gain in report.confirmations)]
+    sentences = [f"{report.league}: {_change(report)}"]
+    for gain in report.confirmations:
+        low, high = gain.interval
+        interval = f"[{'−∞' if low is None else f'{low:+.0f}'}, {'+∞' if high is None else f'{high:+.0f}'}]"
+        returns = f", returns {gain.difference}" if gain.difference else ""
+        sentences.append(
+            f"{gain.candidate} against {gain.opponent} in {gain.games} new games: {gain.elo:+.0f} Elo"
+            f" {interval}{returns}."
+        )
+    return sentences
 
 
 def _change(report: "NightlyReport") -> str:
@@ -321,15 +329,6 @@ def _change(report: "NightlyReport") -> str:
     if report.champion == report.champion_before:
         return f"{judged}the champion is still {report.champion}."
     return f"{judged}the champion is now {report.champion} (before: {report.champion_before or 'none'})."
-
-
-def _gain(gain: "Confirmation") -> str:
-    low, high = gain.interval
-    interval = f"[{'−∞' if low is None else f'{low:+.0f}'}, {'+∞' if high is None else f'{high:+.0f}'}]"
-    returns = f", returns {gain.difference}" if gain.difference else ""
-    return (
-        f"{gain.candidate} against {gain.opponent} in {gain.games} new games: {gain.elo:+.0f} Elo {interval}{returns}."
-    )
 
 
 def _registered(registry: "Registry") -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -141,7 +141,12 @@ def plain_document(report: Mapping[str, Any]) -> dict[str, Any]:
     about, leaderboard = documents[""], documents["/leaderboard"]
     champion, summary = about["champion"], about["summary"]
     payoff = documents["/payoff"]["payoff"] or {"shares": []}
-    verdicts = (f"/verdicts/{row['verdict']}" for row in documents["/verdicts"]["verdicts"])
+    verdicts = [f"/verdicts/{row['verdict']}" for row in documents["/verdicts"]["verdicts"]]
+    left_out = []
+    if (contestants := leaderboard["total"]) > MOST_CONTESTANTS:
+        left_out.append(f"The payoff matrix contains the best {MOST_CONTESTANTS} of {contestants} contestants.")
+    if len(verdicts) > MOST_VERDICTS:
+        left_out.append(f"Only the newest {MOST_VERDICTS} of {len(verdicts)} verdicts have their evidence.")
     return summary | {
         "league": league,
         "made_at": report["made_at"],
@@ -160,16 +165,8 @@ def plain_document(report: Mapping[str, Any]) -> dict[str, Any]:
         "verdicts": [documents[path] for path in verdicts if path in documents],
         "promotions": [_promotion(event) for event in documents[f"/aliases/{CHAMPION}/history"]["history"]],
         "upsets": [upset | _without_images(documents[_game(upset)]) for upset in summary["upsets"]],
-        "left_out": list(_omissions(documents)),
+        "left_out": left_out,
     }
-
-
-def _omissions(documents: Mapping[str, Any]) -> Iterator[str]:
-    contestants, verdicts = documents["/leaderboard"]["total"], len(documents["/verdicts"]["verdicts"])
-    if contestants > MOST_CONTESTANTS:
-        yield f"The payoff matrix contains the best {MOST_CONTESTANTS} of {contestants} contestants."
-    if verdicts > MOST_VERDICTS:
-        yield f"Only the newest {MOST_VERDICTS} of {verdicts} verdicts have their evidence."
 
 
 def _game(upset: Mapping[str, Any]) -> str:

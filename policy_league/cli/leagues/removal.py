@@ -60,7 +60,7 @@ def remove(
 
 def _sentences(plan: "RemovalPlan") -> Iterator[str]:
     versions = "" if "@" in plan.target else f"{counted(len(plan.versions), 'version')}, "
-    yield f"{plan.target}: {versions}{_megabytes(plan)} of files"
+    yield f"{plan.target}: {versions}{sum(plan.versions.values()) / MEGABYTE:,.1f} MB of files"
     if plan.aliases:
         yield f"  aliases: {', '.join(plan.aliases)}"
     for count, what in ((len(plan.verdicts), "verdicts"), (plan.matches, "recorded matches"), (len(plan.runs), "runs")):
@@ -68,10 +68,6 @@ def _sentences(plan: "RemovalPlan") -> Iterator[str]:
             yield f"  {what}: {count:,}"
     if plan.reasons:
         yield f"In use: {'; '.join(plan.reasons)}."
-
-
-def _megabytes(plan: "RemovalPlan") -> str:
-    return f"{sum(plan.versions.values()) / MEGABYTE:,.1f} MB"
 
 
 def _confirm(plan: "RemovalPlan", yes: bool) -> None:

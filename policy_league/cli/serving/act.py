@@ -46,7 +46,13 @@ def act(
         parsed, policy = CheckpointRef(model.league, CHAMPION), policy or model.policy
     if not isinstance(parsed, CheckpointRef):
         raise InvalidReference(f"{ref} is not a version. Only versions can be served, such as connect_four@champion")
-    value = _first_observation(parsed, policy) if observation is None else _read(observation)
+    if observation is None:
+        from evaluation.playback.single_game import first_observation
+
+        league = open_registry().leagues.get(parsed.league)
+        value = first_observation(league.config, league.interface, policy)
+    else:
+        value = _read(observation)
     response = (_act_here if local else _ask)(parsed, policy, value, explore, seed, url)
     if as_json:
         emit(response)
@@ -105,13 +111,6 @@ def _act_here(
         "version": version.number,
         "sha256": version.sha256,
     }
-
-
-def _first_observation(ref: CheckpointRef, policy: str | None) -> Any:
-    from evaluation.playback.single_game import first_observation
-
-    league = open_registry().leagues.get(ref.league)
-    return first_observation(league.config, league.interface, policy)
 
 
 def _read(observation: str) -> Any:

@@ -25,7 +25,10 @@ def runs(
     """
     registry = open_registry()
     rows = registry.runs.newest(check_slug("league", league), limit=limit)
-    strength = {row.id: _newest_strength(registry.strength.of_run(league, row.id)) for row in rows}
+    strength = {}
+    for row in rows:
+        scores = registry.strength.of_run(league, row.id)
+        strength[row.id] = [score for score in scores if score.version == scores[-1].version]  # the newest one's
     if as_json:
         emit({"league": league, "runs": [_run_document(row, strength[row.id]) for row in rows]})
         return
@@ -48,11 +51,6 @@ def runs(
         prose=("strength",),
         optional=("strength",),
     )
-
-
-def _newest_strength(rows: "Sequence[StrengthRow]") -> "list[StrengthRow]":
-    """The scores of the newest measured version."""
-    return [row for row in rows if row.version == rows[-1].version]
 
 
 def _score(row: "StrengthRow", league: str) -> str:

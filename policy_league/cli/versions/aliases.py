@@ -254,7 +254,10 @@ def history(
     as_json: AsJson = False,
 ) -> None:
     """Show when and why an alias moved, and who moved it."""
-    when = None if at is None else _moment(at)
+    try:
+        when = None if at is None else datetime.fromisoformat(at).astimezone(UTC)  # local time, unless it says another
+    except ValueError as error:
+        raise ConfigError(f"--at {at!r}: expected a time such as '2026-03-03 14:00'") from error
     registry = open_registry()
     events = registry.aliases.history(check_slug("league", league), check_alias(alias), when)
     mixtures = registry.versions.mixtures(league, {event.version for event in events})
@@ -291,11 +294,3 @@ def _document(event: "AliasEvent") -> dict[str, object]:
 
 def _short(verdict: str | None) -> str | None:
     return None if verdict is None else short_verdict(verdict)
-
-
-def _moment(text: str) -> datetime:
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise ConfigError(f"--at {text!r}: expected a time such as '2026-03-03 14:00'") from error
-    return (moment if moment.tzinfo else moment.astimezone()).astimezone(UTC)
