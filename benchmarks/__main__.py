@@ -14,8 +14,8 @@ from typer.core import TyperGroup
 from benchmarks.harness import ROOT, Quick, Target, record
 
 FOLDER = Path(__file__).parent
-COMPARES_CHECKOUTS = "revisions"
-"""Needs another checkout: `all` does not run it."""
+NEED_ARGUMENTS = ("learner", "revisions")
+"""Need the Python of another environment, or another checkout: `all` does not run them."""
 
 
 def names() -> list[str]:
@@ -73,11 +73,11 @@ def _options(
 
 @app.command("all")
 def run_all(quick: Quick = False) -> None:
-    """Run all benchmarks but `revisions`, each in a process of its own, which has its own Ray."""
+    """Run all benchmarks but `learner` and `revisions`, each in a process of its own, which has its own Ray."""
     options = ["--quick"] if quick else []
     failed = []
     for name in names():
-        if name != COMPARES_CHECKOUTS:
+        if name not in NEED_ARGUMENTS:
             print(f"\n== {name} ==", flush=True)
             if subprocess.run([sys.executable, "-m", "benchmarks", name, *options], cwd=ROOT).returncode:
                 failed.append(name)

@@ -10,11 +10,11 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from statistics import median
-from typing import IO
+from typing import IO, Any
 
 from benchmarks.harness import ROOT, Parts, Quick, Target, chosen
 
@@ -160,7 +160,7 @@ def rate(seconds):
         return measure(url, BODY, connections=32, seconds=10 * seconds, warm_up=4).rate
 """
 MLP = {"train_batch_size": 4096, "minibatch_size": 512}
-CONVOLUTIONAL = {"train_batch_size": 8192, "minibatch_size": 1024, "teacher": None, "opponents": []}
+CONVOLUTIONAL: dict[str, Any] = {"train_batch_size": 8192, "minibatch_size": 1024, "teacher": None, "opponents": []}
 PARTS = {
     "stepping connect_four": STEPPING.format(case="connect_four"),
     "stepping simple_spread": STEPPING.format(case="simple_spread"),
@@ -180,19 +180,24 @@ PARTS = {
 
 
 class Worker:
-    """A process that measures one checkout on request."""
+    """A process that measures a program on request."""
 
-    def __init__(self, checkout: Path, program: str, scratch: str) -> None:
-        one_thread = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": ""}
+    def __init__(self, command: Sequence[str | Path], directory: Path, environment: Mapping[str, str]) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-c", WORKER % program, scratch],
-            cwd=checkout,
-            env=os.environ | one_thread,
+            command,
+            cwd=directory,
+            env=os.environ | environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
         )
+
+    @classmethod
+    def of_checkout(cls, checkout: Path, program: str, scratch: str) -> "Worker":
+        """A process that measures one checkout."""
+        one_thread = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": ""}
+        return cls([sys.executable, "-c", WORKER % program, scratch], checkout, one_thread)
 
     def measure(self, seconds: float) -> float:
         """Results per second."""
@@ -239,7 +244,6 @@ def _rounds(checkout: Path, program: str, rounds: int, seconds: float) -> Iterat
 def _workers(checkout: Path, program: str) -> Iterator[tuple[Worker, Worker]]:
     with ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory())
-        first, second = (
-            stack.enter_context(closing(Worker(code, program, scratch))) for code in (ROOT, checkout.resolve())
-        )
+        checkouts = (ROOT, checkout.resolve())
+        first, second = (stack.enter_context(closing(Worker.of_checkout(code, program, scratch))) for code in checkouts)
         yield first, second
