@@ -110,9 +110,9 @@ def program(network: str, environments: int, steps: int, minibatch: int) -> tupl
         action = jax.random.categorical(choice, log_p)
         after = play(state, action, jax.random.split(chance, environments))
         reward = jnp.take_along_axis(after.rewards, player[:, None], 1)[:, 0]
-        taken = jnp.take_along_axis(log_p, action[:, None], 1)[:, 0]
+        action_log_p = jnp.take_along_axis(log_p, action[:, None], 1)[:, 0]
         done = after.terminated | after.truncated
-        return (parameters, after), Transition(board, mask, action, taken, value, reward, done)
+        return (parameters, after), Transition(board, mask, action, action_log_p, value, reward, done)
 
     def gae(following: Any, step: Transition) -> tuple[Any, Any]:
         # The value and the advantage of the next step are those of the other player.
