@@ -9,7 +9,7 @@ A request is answered in the process that it reaches first, and bypasses Ray Ser
 
 import gc
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
 from importlib import import_module
@@ -44,7 +44,7 @@ from serve_app.inference_protocol.rest import InferRoute, RestRoutes
 from serve_app.inference_protocol.statistics import REPORT
 from serve_app.live_versions.alias_slots import AliasSlots
 from serve_app.live_versions.registry_connection import RegistryConnection
-from serve_app.live_versions.registry_watcher import RegistryWatcher
+from serve_app.live_versions.registry_watcher import RegistryWatcher, WatchedState
 from serve_app.live_versions.resolver import ModelResolver
 from serve_app.live_versions.shadow import Shadow
 from serve_app.live_versions.traffic_split import TrafficSplit
@@ -66,9 +66,8 @@ from serve_app.routes.table import OF_REGISTRY, ROUTES
 from serve_app.routes.traffic import TrafficRoutes
 from serve_app.runtime import autoscaling, ray_serve, serve_bypass, uvicorn_http, uvicorn_websocket
 from serve_app.runtime.replica_process import ReplicaProcess, this_process
-from serve_app.settings import ServeSettings, is_exposed
+from serve_app.settings import ServeSettings
 
-LOOPBACK = "127.0.0.1"
 NAMES = {action.API: "act", stream_session.API: "stream", inference.API: "infer"}
 """Name of the route of each kind of inference request; gRPC counts as `infer`."""
 PATHS = {route.name: route.path for route in ROUTES}
@@ -112,11 +111,8 @@ class PolicyServer(ray_serve.AsgiReplica):
             registry,
             settings,
             ray_serve.replica_id(),
-            process=ray_serve.replica_process(),
-            machine=ray_serve.node_address(),
-            is_exposed=is_exposed(ray_serve.listening_host()),
-            evaluation_client=evaluation_service and ServeEvaluationClient(evaluation_service, settings.timeout),
-            is_draining=ray_serve.is_draining,
+            ray_serve.replica_process(),
+            evaluation_service and ServeEvaluationClient(evaluation_service, settings.timeout),
         )
         self._load = LoadSampler(self._replica.metrics)
         self._count_requests = ray_serve.request_counter()
@@ -150,10 +146,7 @@ class Replica:
     """The components of a replica. Independent of Ray.
 
     process: The process of the replica; by default this one, known by its machine.
-    machine: Address of its node.
-    is_exposed: Whether other machines reach it.
     evaluation_client: None without an evaluation service.
-    is_draining: Returns whether the replica is being stopped.
     """
 
     def __init__(
@@ -162,11 +155,9 @@ class Replica:
         settings: ServeSettings,
         replica: str,
         process: ReplicaProcess | None = None,
-        machine: str = LOOPBACK,
-        is_exposed: bool = False,
         evaluation_client: EvaluationClient | None = None,
-        is_draining: Callable[[], bool] = lambda: False,
     ) -> None:
+        process = process or this_process()
         self.registry = registry
         self.settings = settings
         self.replica = replica
@@ -197,46 +188,39 @@ class Replica:
         self.connection = RegistryConnection(Registry.open(registry.storage, create=False, listens=True))
         self.watcher = RegistryWatcher(
             self.connection,
-            self.alias_slots,
-            self.traffic,
-            selections,
-            self.api_keys.update,
+            WatchedState(self.alias_slots, self.traffic, selections, self.api_keys.update),
             replica,
-            process or this_process(),
+            process,
             settings,
             on_heartbeat=registry.database.close_unused,
             on_replicas=lambda number: self.stream.replicas_counted(number),
-            is_draining=is_draining,
         )
-        self.access = AccessControl(self.api_keys, settings, Permissions(ROUTES), is_exposed)
+        self.access = AccessControl(self.api_keys, settings, Permissions(ROUTES), process.is_exposed)
         self.action = ActionRoute(self.models, self.access, self.shadow, self.metrics, settings, replica)
         dependencies = StreamDependencies(
             self.models, self.alias_slots, self.traffic, self.shadow, self.metrics, self.access, settings
         )
-        self.stream = StreamRoute(dependencies, replica, is_draining)
+        self.stream = StreamRoute(dependencies, replica, process.is_draining)
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
-        self.reporter = MetricsReporter(
-            self.connection, self.metrics, self.shadow, self._in_flight, self._statistics, replica, settings
-        )
+        self.reporter = MetricsReporter(self.connection, self.metrics, self.shadow, self._statistics, replica, settings)
         self._load = LoadSampler(self.metrics)
         self._evaluation_client = evaluation_client
         self.events = EventBroker(self.models, settings)
         self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings, self.reporter.report)
         self.inference_service = InferenceService(
-            self.inference, self.catalogue, self.watcher, self.access, settings, machine, self.metrics.count_error
+            self.inference, self.catalogue, self.watcher, self.access, settings, process.address
         )
 
-    def _in_flight(self) -> dict[str, int]:
-        return {
+    def _statistics(self) -> Report:
+        sample = self._load.sample()
+        in_flight = {
             "action": self.action.in_flight,
             "infer": self.inference.in_flight,
             "stream": self.stream.connections.open,
             "events": self.events.connections.open,
         }
-
-    def _statistics(self) -> Report:
-        sample = self._load.sample()
         return {
+            "league_requests_in_flight": [[[api], count] for api, count in in_flight.items()],
             REPORT: self.inference.statistics.documents(),
             "league_replica_load": [] if sample is None else [[[], sample.load]],
         }

@@ -15,7 +15,7 @@ from league.settings import Storage
 from serve_app.access.api_keys import ApiKeyCache
 from serve_app.live_versions.alias_slots import AliasSlots
 from serve_app.live_versions.registry_connection import RegistryConnection
-from serve_app.live_versions.registry_watcher import RegistryWatcher
+from serve_app.live_versions.registry_watcher import RegistryWatcher, WatchedState
 from serve_app.live_versions.traffic_split import TrafficSplit
 from serve_app.live_versions.version_cache import ActionSelections, LoadedVersion, VersionCache
 from serve_app.runtime.replica_process import this_process
@@ -31,10 +31,7 @@ def watcher(storage: Storage, name: str) -> tuple[RegistryWatcher, RegistryConne
     return (
         RegistryWatcher(
             connection,
-            slots,
-            TrafficSplit(slots),
-            ActionSelections(),
-            ApiKeyCache().update,
+            WatchedState(slots, TrafficSplit(slots), ActionSelections(), ApiKeyCache().update),
             name,
             this_process(),
             settings,

@@ -11,7 +11,7 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Any
 import orjson
 from starlette.types import Message, Scope, Send
 
+from serve_app.runtime.background import in_background
 from serve_app.runtime.ray_serve import logger
 
 WRITE_INTERVAL = 0.5
@@ -65,13 +66,10 @@ class AccessLog:
     @asynccontextmanager
     async def writing(self) -> AsyncIterator[None]:
         """Write buffered lines while the context is active, and the remaining ones on exit."""
-        task = asyncio.create_task(self._write_on())
         try:
-            yield
+            async with in_background(self._write_on()):
+                yield
         finally:
-            task.cancel()
-            with suppress(asyncio.CancelledError):
-                await task
             await self._write()
             self._thread.shutdown()
             if self._file is not None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from league.errors import InvalidInput, InvalidState, LeagueError, RateLimited, Unauthenticated
 from league.policies.policy import Actions
 from league.refs import CHAMPION
-from serve_app.access.access_control import AccessControl
+from serve_app.access.access_control import POLICY_VIOLATION, AccessControl
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.errors import MalformedBody, status_of
 from serve_app.access.request_body import parse_json_object
@@ -53,7 +53,6 @@ from serve_app.settings import ServeSettings
 
 STREAM_ONLY_KEYS = frozenset(("reset", "return_state"))
 """Keys that the action route does not accept."""
-POLICY_VIOLATION = 1008
 INVALID_PAYLOAD = 1007
 API = "stream"
 """Name of stream messages in metrics."""

@@ -1,6 +1,5 @@
 """The Open Inference Protocol over gRPC: messages to requests and back, and the service that answers them."""
 
-from collections.abc import Callable
 from functools import lru_cache
 from ipaddress import IPv6Address, ip_address
 from typing import Any
@@ -129,7 +128,7 @@ EMPTY = ("ServerLive", "ServerReady", "ServerMetadata")
 
 
 class InferenceService:
-    """The gRPC service of a replica. `machine`: the node's address; `count`: called for each error."""
+    """The gRPC service of a replica. `machine`: the node's address."""
 
     def __init__(
         self,
@@ -139,7 +138,6 @@ class InferenceService:
         access: AccessControl,
         settings: ServeSettings,
         machine: str,
-        count: Callable[[str, str], None],
     ) -> None:
         self._inference = inference
         self._catalogue = catalogue
@@ -147,7 +145,6 @@ class InferenceService:
         self._access = access
         self._settings = settings
         self._machine = machine
-        self._count = count
 
     async def call(self, rpc: str, request_type: type[Message], context: grpc.aio.ServicerContext) -> Message:
         """Answer a call. Raises LeagueError.
@@ -176,7 +173,7 @@ class InferenceService:
                     check_counts(request, served.signature)
                 return await self._inference.infer(read_request(request, len(body)), write_response, headers)
         except LeagueError as error:
-            self._count(f"/v2/models/{model}", error.code)
+            self._inference.metrics.count_error(f"/v2/models/{model}", error.code)
             raise
 
     async def _read(self, context: grpc.aio.ServicerContext, limit: int) -> bytes:

@@ -71,7 +71,7 @@ class Inference:
     def __init__(self, models: ModelResolver, shadow: Shadow, metrics: Metrics, settings: ServeSettings) -> None:
         self._models = models
         self._shadow = shadow
-        self._metrics = metrics
+        self.metrics = metrics
         self._settings = settings
         self._signatures: WeakKeyDictionary[LoadedPolicy, Signature] = WeakKeyDictionary()
         self.statistics = Statistics()
@@ -124,7 +124,7 @@ class Inference:
         rows = len(next(iter(arrays.values())))
         done = perf_counter_ns()
         entry.succeed(rows, start, lookup_end, read, ran, done)
-        self._metrics.count_request(API, request.model, served.version, rows, done - start)
+        self.metrics.count_request(API, request.model, served.version, rows, done - start)
         return encoded
 
     async def _read(self, request: InferRequest, signature: Signature) -> dict[str, NDArray]:

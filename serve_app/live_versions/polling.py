@@ -3,11 +3,11 @@
 import asyncio
 import random
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 
 from league.errors import LeagueError
+from serve_app.runtime.background import in_background
 from serve_app.runtime.ray_serve import logger
-from serve_app.settings import ServeSettings
 
 JITTER = 0.1
 """Relative variation of a pause, so that replicas do not poll at the same time."""
@@ -19,25 +19,28 @@ OVERDUE = 5.0
 class Polling:
     """Calls `poll` in a task on the event loop.
 
-    subject: names the polled data in log lines: `aliases`. pause: waits for a number of seconds, or until there is a
-    reason to poll again.
+    subject: names the polled data in log lines: `aliases`. interval, slowest: seconds between two polls, which are
+    doubled up to `slowest`, unless the interval is longer, while polls fail. pause: waits for a number of seconds, or
+    until there is a reason to poll again.
     """
 
     def __init__(
         self,
         poll: Callable[[], Awaitable[None]],
         subject: str,
-        settings: ServeSettings,
+        interval: float,
+        slowest: float,
         pause: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
         self._poll = poll
         self._wait = pause
         self._subject = subject
-        self._settings = settings
+        self._interval = interval
+        self._slowest = max(interval, slowest)
         self._random = random.Random()
         self._has_seen = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
-        self._pause = settings.poll
+        self._pause = interval
         self._fault: str | None = None
         """The last error that was logged; None after a success."""
 
@@ -53,14 +56,9 @@ class Polling:
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Poll while the context is active; enters after the first `mark_ready`."""
-        self._task = asyncio.create_task(self._run())
-        try:
+        async with in_background(self._run()) as self._task:
             await self._has_seen.wait()
             yield
-        finally:
-            self._task.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._task
 
     async def _run(self) -> None:
         while True:
@@ -73,12 +71,12 @@ class Polling:
                 if str(error) != self._fault:
                     logger.error("cannot poll %s, keeping the last known state: %s", self._subject, error, exc_info=bug)
                 self._fault = str(error)
-                self._pause = min(2 * self._pause, self._settings.poll_slowest)
+                self._pause = min(2 * self._pause, self._slowest)
             else:
                 if self._fault is not None:
                     logger.error("polling %s again", self._subject)
                 self._fault = None
-                self._pause = self._settings.poll
+                self._pause = self._interval
             finally:
                 overdue.cancel()
             await self._wait(self._pause * self._random.uniform(1 - JITTER, 1 + JITTER))

@@ -61,40 +61,45 @@ class _Acknowledged:
     differing: dict[str, ServedState] = field(default_factory=dict)
 
 
-class RegistryWatcher:
-    """Keeps slots, traffic, action selections and keys at what the registry requires, and acknowledges it as `replica`.
+@dataclass(frozen=True, slots=True)
+class WatchedState:
+    """What a replica keeps as the registry requires.
 
-    update_keys: raises StorageError if the keys are those of a different database. on_heartbeat: called at each
-    heartbeat, in the thread of the connection. on_replicas: called after each heartbeat with the number of replicas
-    that are not being stopped. is_draining: whether this one is.
+    update_keys: raises StorageError if the keys are those of a different database.
+    """
+
+    slots: AliasSlots
+    traffic: TrafficSplit
+    selections: ActionSelections
+    update_keys: Callable[[list[KeyRow]], None]
+
+
+class RegistryWatcher:
+    """Keeps the state of a replica at what the registry requires, and acknowledges it as `replica`.
+
+    on_heartbeat: called at each heartbeat, in the thread of the connection. on_replicas: called after each heartbeat
+    with the number of replicas that are not being stopped.
     """
 
     def __init__(
         self,
         connection: RegistryConnection,
-        slots: AliasSlots,
-        traffic: TrafficSplit,
-        selections: ActionSelections,
-        update_keys: Callable[[list[KeyRow]], None],
+        state: WatchedState,
         replica: str,
         process: ReplicaProcess,
         settings: ServeSettings,
         on_heartbeat: Callable[[], None] = lambda: None,
         on_replicas: Callable[[int], None] = lambda _: None,
-        is_draining: Callable[[], bool] = lambda: False,
     ) -> None:
         self._connection = connection
-        self._slots = slots
-        self._traffic = traffic
-        self._selections = selections
-        self._update_keys = update_keys
+        self._state = state
+        self._slots, self._traffic = state.slots, state.traffic
         self._replica = replica
         self._process = process
         self._settings = settings
         self._on_heartbeat = on_heartbeat
         self._on_replicas = on_replicas
-        self._is_draining = is_draining
-        self._polling = Polling(self.poll_once, "the registry", settings, self._pause)
+        self._polling = Polling(self.poll_once, "the registry", settings.poll, settings.poll_slowest, self._pause)
         self._aliases: Mapping[Alias, AliasTarget] = {}
         self._wanted_traffic: Mapping[str, Setting] = {}
         self._position = ReadPosition(0, 0, 0)
@@ -167,7 +172,7 @@ class RegistryWatcher:
 
         Returns whether this one was registered, and the number of replicas that are not being stopped.
         """
-        is_known = registry.replicas.register(self._replica, self._process.description, self._is_draining())
+        is_known = registry.replicas.register(self._replica, self._process.description, self._process.is_draining())
         overdue = OVERDUE_HEARTBEATS * timedelta(seconds=self._settings.heartbeat)
         replicas = registry.replicas.counts(overdue)
         silent = registry.replicas.silent(overdue) if replicas.silent else []
@@ -201,7 +206,7 @@ class RegistryWatcher:
         if read.aliases is not None and not read.aliases and self._aliases:
             raise StorageError("the registry has no aliases, but had some before: it is a different database")
         if read.keys is not None:
-            self._update_keys(read.keys)
+            self._state.update_keys(read.keys)
         if read.aliases is not None:
             self._aliases = read.aliases
             newest_events: dict[str, int] = {}
@@ -211,7 +216,7 @@ class RegistryWatcher:
         if read.traffic is not None:
             self._wanted_traffic = read.traffic
         if read.selections is not None:
-            self._selections.update(read.selections)
+            self._state.selections.update(read.selections)
         settings = (one.id or 0 for one in self._wanted_traffic.values())
         newest = max(self._newest_events.values(), default=0), max(settings, default=0)
         self._position = ReadPosition(read.counts.to_acknowledge, *newest)

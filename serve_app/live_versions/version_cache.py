@@ -29,7 +29,7 @@ from league.registry.storage.rows import VersionState
 from league.spaces import Box, Leaf
 from serve_app.codecs.observation_codec import ObservationReader
 from serve_app.codecs.request_limits import RequestLimits
-from serve_app.live_versions.daemon_thread import in_daemon_thread
+from serve_app.runtime.background import in_daemon_thread
 
 SHADOW_TIMEOUT = 1.0
 """Seconds after which a run of a shadow is ended, and counted as failed."""

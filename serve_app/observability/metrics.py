@@ -65,8 +65,6 @@ class Metrics:
         self._by_request: dict[tuple[str, str, int], RequestStats] = {}
         self._errors: Counter[tuple[str, str]] = Counter()
         self._started_at = time()
-        self.in_flight: dict[str, int] = {}
-        """api → requests in flight, as of the last report"""
 
     def count_request(self, api: str, model: str, version: LoadedVersion, rows: int, ns: int) -> None:
         """Count a request of `rows` observations that took `ns` nanoseconds."""
@@ -139,7 +137,6 @@ class Metrics:
             ],
             "league_faults": [[[league], int(league in faults)] for league in leagues],
             "league_swaps_total": [[[league], self._slots.swaps[league]] for league in leagues],
-            "league_requests_in_flight": [[[api], count] for api, count in self.in_flight.items()],
             "league_replica_start_time_seconds": [[[], self._started_at]],
             "league_replica_resident_bytes": [[[], PAGE_SIZE * int(MEMORY.read_text("ascii").split()[1])]],
         }

@@ -77,7 +77,6 @@ class MetricsReporter:
         connection: RegistryConnection,
         metrics: Metrics,
         shadow: Shadow,
-        in_flight: Callable[[], dict[str, int]],
         further: Callable[[], Report],
         replica: str,
         settings: ServeSettings,
@@ -85,12 +84,9 @@ class MetricsReporter:
         self._connection = connection
         self._metrics = metrics
         self._shadow = shadow
-        self._in_flight = in_flight
         self._further = further
         self._replica = replica
-        slowest = max(settings.heartbeat, settings.poll_slowest)
-        pace = settings.model_copy(update={"poll": settings.heartbeat, "poll_slowest": slowest})
-        self._polling = Polling(self._poll, "reports", pace)
+        self._polling = Polling(self._poll, "reports", settings.heartbeat, settings.poll_slowest)
         self._rates = RequestRates()
         self._last_rates: Samples = []
         self._disks = DiskSpace(connection.storage)
@@ -114,7 +110,6 @@ class MetricsReporter:
         """Write all metrics, the request rates of the last regular report, and the shadow counts that changed. Raises
         StorageError."""
         self._polling.mark_ready()
-        self._metrics.in_flight = self._in_flight()
         shadowings = [
             one
             for one in self._shadow.shadowings()

@@ -79,9 +79,7 @@ class EventBroker:
         self._topics: dict[str, Topic] = {}
         self._is_over = False
         self.connections = ConnectionLimit("event streams", settings.max_listeners, settings.max_listeners_per_key)
-        slowest = max(settings.poll_events, settings.poll_slowest)
-        pace = settings.model_copy(update={"poll": settings.poll_events, "poll_slowest": slowest})
-        self._polling = Polling(self._poll, "event streams", pace)
+        self._polling = Polling(self._poll, "event streams", settings.poll_events, settings.poll_slowest)
 
     @property
     def topics(self) -> int:

@@ -29,6 +29,7 @@ from serve_app.inference.action_request import REPLICA
 from serve_app.inference.stream_session import StreamDependencies, StreamSession
 from serve_app.live_versions.resolver import policy_ref, version_of
 from serve_app.routes.query_string import query_params
+from serve_app.runtime.background import in_background
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import (
     STREAM_PROTOCOL,
@@ -161,11 +162,8 @@ class StreamRoute:
     @asynccontextmanager
     async def checking(self) -> AsyncIterator[None]:
         """Close streams whose keys become invalid, or all if this replica is stopped, while the context is active."""
-        checking = asyncio.create_task(self._check())
-        try:
+        async with in_background(self._check()):
             yield
-        finally:
-            checking.cancel()
 
     async def _check(self) -> None:
         while True:

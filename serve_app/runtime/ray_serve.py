@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from league.errors import NotReady
 from serve_app.runtime.replica_process import ReplicaProcess, this_process
+from serve_app.settings import is_exposed
 
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
@@ -85,6 +86,9 @@ def replica_process() -> ReplicaProcess:
     return ReplicaProcess(
         {**process.description, **actor},
         lambda other: process.has_ended(other) or _actor_has_ended(other, context.namespace),
+        node_address(),
+        is_exposed(listening_host()),
+        is_draining,
     )
 
 

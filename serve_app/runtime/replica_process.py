@@ -1,4 +1,4 @@
-"""Where a replica runs, and whether the process of another one has ended.
+"""Where a replica runs, who reaches it, and whether the process of another one has ended.
 
 A process knows this only of processes on its machine and of actors in its Ray cluster. A replica that is stuck, or cut
 off from the network, has not ended.
@@ -10,17 +10,26 @@ from dataclasses import dataclass
 from league.registry import processes
 from league.registry.replicas import PROCESS
 
+LOOPBACK = "127.0.0.1"
+
 
 @dataclass(frozen=True, slots=True)
 class ReplicaProcess:
     """The process of this replica.
 
-    description: where it runs, for other replicas. has_ended: whether the process with a description has certainly
-    ended.
+    Attributes:
+        description: Where it runs, for other replicas.
+        has_ended: Whether the process with a description has certainly ended.
+        address: Address of its machine.
+        is_exposed: Whether other machines reach it.
+        is_draining: Returns whether it is being stopped.
     """
 
     description: Mapping[str, str]
     has_ended: Callable[[Mapping[str, str]], bool]
+    address: str = LOOPBACK
+    is_exposed: bool = False
+    is_draining: Callable[[], bool] = lambda: False
 
 
 def this_process() -> ReplicaProcess:

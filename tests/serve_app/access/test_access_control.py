@@ -4,6 +4,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from serve_app.access.load_shedding import Backlog
 from serve_app.app import Replica
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.runtime.haproxy_script import KEY_ACCEPTED
+from serve_app.runtime.replica_process import this_process
 from serve_app.settings import ServeSettings
 from tests.support.clients.actions import BOARD
 from tests.support.leagues.served_leagues import everything
@@ -41,7 +43,7 @@ def serving_replica(registry: Registry, is_exposed: bool = False, **settings: An
         Registry.open(registry.storage),
         ServeSettings.model_validate(QUICK.model_dump() | settings),
         "replica-1",
-        is_exposed=is_exposed,
+        replace(this_process(), is_exposed=is_exposed),
     )
     with local_client(server) as client:
         yield client

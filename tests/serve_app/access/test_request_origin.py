@@ -3,6 +3,8 @@
 A server without keys on loopback answers only requests that name it so.
 """
 
+from dataclasses import replace
+
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
 
@@ -11,6 +13,7 @@ from league.settings import Storage
 from serve_app.access.errors import CrossSiteRequest, UntrustedHost
 from serve_app.access.request_origin import reject_cross_site, reject_foreign_host
 from serve_app.app import Replica
+from serve_app.runtime.replica_process import this_process
 from tests.support.clients.actions import BOARD
 from tests.support.servers.replicas import QUICK
 
@@ -140,7 +143,8 @@ def test_a_rebound_page_cannot_act(read_only_client: TestClient) -> None:
 
 @pytest.mark.parametrize(("settings", "is_exposed"), [({"require_keys": "never"}, False), ({}, True)])
 def test_other_servers_have_any_name(storage: Storage, settings: dict[str, str], is_exposed: bool) -> None:
-    server = Replica(Registry.open(storage), QUICK.model_copy(update=settings), "replica-1", is_exposed=is_exposed)
+    process = replace(this_process(), is_exposed=is_exposed)
+    server = Replica(Registry.open(storage), QUICK.model_copy(update=settings), "replica-1", process)
     with TestClient(server.application(), base_url="http://league.example") as client:
         assert client.get("/v1/leagues").status_code == (401 if is_exposed else 200)
 

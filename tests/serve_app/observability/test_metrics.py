@@ -138,7 +138,7 @@ async def test_the_number_of_series_is_limited(registry: Registry) -> None:
 
 ADDED_LATER = {
     *("league_disk_free_bytes", "league_disk_size_bytes"),
-    *("league_evaluations", "league_silent_replicas", "league_replica_load"),
+    *("league_evaluations", "league_silent_replicas", "league_replica_load", "league_requests_in_flight"),
 }
 """Metrics that the reporter or the route adds."""
 
