@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import torch
+
 from league.config.league import LeagueConfig
 from league.interface import Interface
 from league.registry.storage.manifest import MANIFEST
@@ -53,7 +55,8 @@ def trial_strength(
     Raises LeagueError if they cannot be exported, or if a game fails.
     """
     assert config.training.strength is not None, "checked before the sweep begins"
-    with tempfile.TemporaryDirectory(prefix="league-trial-") as directory:
+    # Modules are initialised when they are loaded. The trial must continue as it does after an interruption.
+    with torch.random.fork_rng(devices=[]), tempfile.TemporaryDirectory(prefix="league-trial-") as directory:
         files = Path(directory)
         manifest = export(Checkpoint(checkpoint, "", 0), files, 0, config=config, interface=interface)
         (files / MANIFEST).write_text(manifest.to_json())
