@@ -108,11 +108,7 @@ def integer(
 def text(name: str, description: str = "", example: str | None = None) -> Parameter:
     """A name or a cursor of the query."""
 
-    def parse(value: str) -> str:
-        if not _is_name(value):
-            raise InvalidInput(f"{name} must be 1 to {MAX_NAME_LENGTH} printable characters, got {value[:32]!r}")
-        return value
-
+    parse = _named(InvalidInput, f"{name} must be 1 to {MAX_NAME_LENGTH} printable characters, got")
     schema = {"type": "string", "minLength": 1, "maxLength": MAX_NAME_LENGTH}
     return Parameter(name, schema, description, parse=parse, example=example)
 
@@ -132,21 +128,17 @@ def moment(name: str, description: str, example: str) -> Parameter:
     return Parameter(name, {"type": "string", "format": "date-time"}, description, parse=parse, example=example)
 
 
-def _is_name(value: str) -> bool:
-    """Whether databases accept the text: PostgreSQL refuses NUL characters."""
-    return value.isprintable() and 1 <= len(value) <= MAX_NAME_LENGTH
-
-
 def _number(smallest: int, largest: int = MAX_VERSION) -> dict[str, Any]:
     return {"type": "integer", "minimum": smallest, "maximum": largest}
 
 
-def _named(unknown: type[NotFound]) -> Callable[[str], str]:
-    """A parser of names, which raises `unknown` if no object can have that name."""
+def _named(refusal: type[LeagueError], problem: str = "invalid name") -> Callable[[str], str]:
+    """A parser of names, which raises `refusal` if no object can have that name."""
 
     def parse(value: str) -> str:
-        if not _is_name(value):
-            raise unknown(f"invalid name {value[:32]!r}")
+        # PostgreSQL refuses NUL characters.
+        if not (value.isprintable() and 1 <= len(value) <= MAX_NAME_LENGTH):
+            raise refusal(f"{problem} {value[:32]!r}")
         return value
 
     return parse

@@ -58,6 +58,17 @@ def decode(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:
     return _decode_array(name, value, leaf) if B64 in value else _decode_images(name, value, leaf)
 
 
+def little_endian(name: str, data: bytes | memoryview, dtype: np.dtype, type_name: str = "bool") -> NDArray:
+    """The elements in bytes, (n,). Raises ObservationError for a boolean that is neither 0 nor 1.
+
+    type_name: that of booleans in error messages.
+    """
+    array = np.frombuffer(data, dtype)
+    if dtype.kind == "b" and (array.view(np.uint8) > 1).any():
+        raise ObservationError(f"{name} has bytes other than 0 and 1, expected {type_name}")
+    return array if array.flags.aligned else array.copy()  # kernels of a graph require alignment
+
+
 def _decode_array(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:
     if not value.keys() <= ARRAY_KEYS:
         raise ObservationError(
@@ -78,10 +89,8 @@ def _decode_array(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:
         raise ObservationError(
             f"{name}.b64 holds {len(data)} bytes, expected {size}: {leaf.dtype} of shape {list(leaf.shape)}"
         )
-    array = np.frombuffer(data, np.dtype(leaf.dtype).newbyteorder("<")).astype(leaf.dtype, copy=False)
-    if array.dtype == bool and (array.view(np.uint8) > 1).any():
-        raise ObservationError(f"{name}.b64 has bytes other than 0 and 1, expected bool")
-    return array.reshape(leaf.shape)
+    array = little_endian(f"{name}.b64", data, np.dtype(leaf.dtype).newbyteorder("<"))
+    return array.astype(leaf.dtype, copy=False).reshape(leaf.shape)
 
 
 def _decode_images(name: str, value: dict[str, Any], leaf: Leaf) -> NDArray:

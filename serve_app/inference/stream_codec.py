@@ -20,6 +20,7 @@ from league.errors import BodyTooLarge, InvalidInput, ObservationError
 from league.policies.onnx import ACTION
 from league.spaces import ACTION_MASK, Leaf
 from league.spaces.arrays import check, check_mask
+from serve_app.codecs.binary_leaves import little_endian
 from serve_app.live_versions.version_cache import LoadedPolicy
 
 FRAMING = 1
@@ -75,7 +76,8 @@ class BinaryCodec:
         arrays, at = {}, 0
         for tensor in self._inputs:
             end = at + request.rows * tensor.size
-            arrays[tensor.name] = _array(request.tensors[at:end], tensor, request.rows)
+            array = little_endian(tensor.name, request.tensors[at:end], tensor.dtype)
+            arrays[tensor.name] = check(tensor.name, array.reshape(request.rows, *tensor.leaf.shape), tensor.leaf)
             at = end
         if self._is_masked:
             check_mask(arrays[ACTION_MASK])
@@ -116,15 +118,6 @@ def _resets(data: bytes, rows: int) -> NDArray:
     if len(data) != rows or data.strip(b"\0\1"):
         raise InvalidInput(f"resets must be {rows} bytes of 0 or 1")
     return np.frombuffer(data, np.bool_)
-
-
-def _array(data: memoryview, each: _Input, rows: int) -> NDArray:
-    array = np.frombuffer(data, each.dtype)
-    if each.dtype.kind == "b" and (array.view(np.uint8) > 1).any():
-        raise ObservationError(f"{each.name} has bytes other than 0 and 1, expected bool")
-    if not array.flags.aligned:  # kernels of the graph require alignment
-        array = array.copy()
-    return check(each.name, array.reshape(rows, *each.leaf.shape), each.leaf)
 
 
 def _little(dtype: str) -> np.dtype:

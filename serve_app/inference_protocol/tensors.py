@@ -19,6 +19,7 @@ from league.policies.open_inference_signature import DATATYPES
 from league.registry.storage.manifest import PolicyManifest
 from league.spaces import ACTION_MASK, Box, Leaf, inputs
 from league.spaces.arrays import check, check_mask
+from serve_app.codecs.binary_leaves import little_endian
 
 _BY_DTYPE = {
     np.dtype(name): datatype for name, datatype in DATATYPES.items()
@@ -33,11 +34,6 @@ def datatype_of(array: NDArray) -> str:
 def to_bytes(array: NDArray) -> bytes:
     """Elements in wire format: row-major, little-endian, one byte per BOOL."""
     return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
-
-
-def from_bytes(data: bytes | memoryview, dtype: str) -> NDArray:
-    """Elements from wire format as a one-dimensional array, which may be read-only and unaligned."""
-    return np.frombuffer(data, np.dtype(dtype).newbyteorder("<"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,12 +150,7 @@ def _array(tensor: RequestTensor, port: TensorSpec, max_batch: int) -> NDArray:
 def _from_buffer(data: bytes | memoryview, shape: tuple[int, ...], port: TensorSpec) -> NDArray:
     if len(data) != (size := prod(shape) * np.dtype(port.leaf.dtype).itemsize):
         raise ObservationError(f"{port.name} has {len(data)} bytes, expected {size} for {_list(shape)} {port.datatype}")
-    array = from_bytes(data, port.leaf.dtype)
-    if port.datatype == "BOOL" and (array.view(np.uint8) > 1).any():
-        raise ObservationError(f"{port.name} has bytes other than 0 and 1, expected BOOL")
-    if not array.flags.aligned:  # kernels of the graph require alignment
-        array = array.copy()
-    return array.reshape(shape)
+    return little_endian(port.name, data, np.dtype(port.leaf.dtype).newbyteorder("<"), "BOOL").reshape(shape)
 
 
 def _from_field(data: Sequence[Any], shape: tuple[int, ...], port: TensorSpec) -> NDArray:

@@ -24,10 +24,10 @@ RATE = "league_requests_per_second"
 class RequestCounts:
     """Requests of one league, over all replicas that report."""
 
-    count: int = 0
+    requests: int = 0
     """Since the replicas started."""
-    rate: float = 0.0
-    """Per second, between their last two reports."""
+    requests_per_second: float = 0.0
+    """Between their last two reports."""
 
 
 class RequestRates:

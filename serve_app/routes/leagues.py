@@ -1,6 +1,7 @@
 """Lists leagues, their versions and what each replica serves; writes notes on versions."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import datetime, timedelta
 from typing import Annotated, Any, Literal
 
@@ -228,7 +229,7 @@ def leagues(registry: Registry, limit: int | None, before: str | None) -> Sequen
             "running_evaluations": sum(evaluations.get(league, {}).values()),
             "running_runs": runs.get(league, 0),
             "archived_at": archived[league],
-        } | _activity(counts.get(league, NO_REQUESTS))
+        } | asdict(counts.get(league, NO_REQUESTS))
 
     return list(map(document, names))
 
@@ -264,7 +265,7 @@ def league(registry: Registry, league: str) -> dict[str, Any]:
         "summary": summary and summary.document,
         "computed_at": summary and summary.at,
         "up_to_date": summary is not None and summary.mark == registry.snapshots.current_marks()[league],
-    } | _activity(counts.get(league, NO_REQUESTS))
+    } | asdict(counts.get(league, NO_REQUESTS))
 
 
 @Declaration(
@@ -316,7 +317,3 @@ def note(registry: Registry, league: str, version: str, body: NoteBody, key: Api
     repeated, and needs no `Idempotency-Key`.
     """
     return registry.versions.set_note(CheckpointRef(league, parse_version(version)), body.note, actor=key.name)
-
-
-def _activity(counts: RequestCounts) -> dict[str, Any]:
-    return {"requests": counts.count, "requests_per_second": counts.rate}

@@ -23,6 +23,8 @@ CALLER_HEADER = "x-league-key"
 LIMITS = httpx.Limits(max_connections=1000, max_keepalive_connections=100, keepalive_expiry=30.0)
 """Limits of one client. The server keeps idle connections for longer, so that the client closes them first."""
 
+_parse_url = lru_cache(maxsize=1024)(httpx.URL)  # a client requests few different URLs
+
 
 class Endpoint:
     """A server's base URL with the API key, the caller and the timeout of one attempt."""
@@ -31,7 +33,13 @@ class Endpoint:
         """Raises InvalidInput if an argument is invalid."""
         if not timeout > 0:
             raise InvalidInput(f"timeout is {timeout:g} s, expected more than 0")
-        self.url = _check_url(url)
+        try:
+            base = httpx.URL(url.rstrip("/"))
+        except httpx.InvalidURL:
+            base = httpx.URL()
+        if base.scheme not in ("http", "https") or not base.host:
+            raise InvalidInput(f"{url!r} is not the address of a server: expected a URL such as http://127.0.0.1:8000")
+        self.url = url.rstrip("/")
         key = os.environ.get(KEY_VARIABLE) if key is None else key
         self.headers = {TIMEOUT_HEADER: str(max(1, round(timeout * 1000)))}
         if key:
@@ -39,7 +47,6 @@ class Endpoint:
         if caller is not None:
             self.headers[CALLER_HEADER] = _check_header("caller", caller)
         self.timeout = timeout
-        base = httpx.URL(self.url)
         host = base.netloc.decode("ascii")
         # httpx would compute these for every request, which takes half of the client's time for it.
         self._headers = httpx.Headers({"host": host, "accept-encoding": "gzip", **self.headers})
@@ -73,23 +80,8 @@ class Endpoint:
         raise parse_error(outcome, url)
 
 
-def _check_url(url: str) -> str:
-    try:
-        parsed = httpx.URL(url)
-    except httpx.InvalidURL:
-        parsed = httpx.URL()
-    if parsed.scheme not in ("http", "https") or not parsed.host:
-        raise InvalidInput(f"{url!r} is not the address of a server: expected a URL such as http://127.0.0.1:8000")
-    return url.rstrip("/")
-
-
 def _check_header(name: str, text: str) -> str:
     text = text.strip()
     if not (text.isascii() and text.isprintable()):
         raise InvalidInput(f"the {name} contains invalid characters: expected printable ASCII")
     return text
-
-
-@lru_cache(maxsize=1024)  # a client requests few different URLs
-def _parse_url(text: str) -> httpx.URL:
-    return httpx.URL(text)
