@@ -1,8 +1,8 @@
 import random
 import re
-import time
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from league.config.league import LeagueConfig
-from league.environments.conformance import examination
+from league.environments.conformance import episodes, examination, time_budget
 from league.environments.conformance.examination import examine
 from league.environments.conformance.findings import Examination
 from league.environments.conformance.openings import OpeningLength, OpeningMeasurement, recommended
@@ -135,8 +135,11 @@ def test_steps_are_those_of_the_environment() -> None:
 class Slow(Simultaneous):
     """Seeds alone do not vary its games."""
 
+    seconds = 0.0
+    """What its steps have taken, by a clock that only they move."""
+
     def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
-        time.sleep(0.02)
+        Slow.seconds += 0.02
         return super().step(actions)
 
     def _observe(self, agent: str) -> np.ndarray:
@@ -147,12 +150,15 @@ def slow() -> Slow:
     return Slow(leaves=(1000, 1000))
 
 
-def test_checks_of_a_slow_environment_are_cut_short_and_reported() -> None:
+def test_checks_of_a_slow_environment_are_cut_short_and_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(monotonic=lambda: Slow.seconds, perf_counter=lambda: Slow.seconds)
+    for module in (time_budget, episodes):
+        monkeypatch.setattr(module, "time", clock)
     doing: list[str] = []
     found = examine(league(f"{__name__}:slow"), seconds=1.0, progress=doing.append)
     assert found.passed, found.findings
     assert re.search(
-        r"the checks were cut short after 1 s, because the environment takes 0.0\d+ s per step: 1 of 3 episodes were"
+        r"the checks were cut short after 1 s, because the environment takes 0.02\d* s per step: 1 of 3 episodes were"
         r" played, the last one only to step \d+, random openings were not measured, PettingZoo's API test was not run",
         findings(found, "note"),
     )
