@@ -148,9 +148,7 @@ class AliasRepository(Repository):
             query = query.where(table.id < before)
         if at is not None:
             query = query.where(table.at <= at).limit(1)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return list(session.scalars(query))
+        return leagues.rows(self._database, league, query)
 
 
 def current(session: Session, league: str) -> dict[str, int]:

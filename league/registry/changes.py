@@ -170,11 +170,11 @@ class ChangeRepository(Repository):
                 return self._names(league, follows)
             if time.monotonic() >= deadline:
                 late = set(self._names(league, follows.is_not(true())))
-                reasons = [
-                    f"{one.replica} {_silence(one)}{describe(one)}"
-                    for one in self._replicas.acknowledgements(league)
-                    if one.replica in late
-                ]
+                reasons = []
+                for one in self._replicas.acknowledgements(league):
+                    if one.replica in late:
+                        seconds = f"has been silent for {one.silence.total_seconds():.0f} s; last known: "
+                        reasons.append(f"{one.replica} {seconds * (one.silence >= LIVENESS_TIMEOUT)}{describe(one)}")
                 problem = (
                     f"{len(reasons)} of {registered} replicas have not confirmed it: {'; '.join(reasons)}"
                     if registered
@@ -190,12 +190,6 @@ class ChangeRepository(Repository):
         query = select(ReplicaTable.replica).select_from(replicas.with_acknowledgement(league)).where(condition)
         with self._database.read() as session:
             return list(session.scalars(query.order_by(ReplicaTable.replica)))
-
-
-def _silence(found: Acknowledgement) -> str:
-    if found.silence < LIVENESS_TIMEOUT:
-        return ""
-    return f"has been silent for {found.silence.total_seconds():.0f} s; last known: "
 
 
 def _serves(found: Acknowledgement, alias: str) -> str:

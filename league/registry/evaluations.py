@@ -101,9 +101,7 @@ class EvaluationRepository(Repository):
         query = select(EvaluationRow).filter_by(league=league).order_by(EvaluationRow.id.desc()).limit(limit)
         if before is not None:
             query = query.where(EvaluationRow.id < before)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return list(session.scalars(query))
+        return leagues.rows(self._database, league, query)
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Return league → state → number of queued and running evaluations, of the leagues that have any."""

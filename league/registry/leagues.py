@@ -5,10 +5,10 @@ import json
 import logging
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
-from sqlalchemy import select
+from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
 from league.conditions import ActionSelection, Conditions, action_selection, default_selection, game_changes
@@ -16,7 +16,7 @@ from league.errors import InterfaceChanged, UnknownLeague
 from league.interface import Interface, digest
 from league.refs import check_new
 from league.registry.storage import change_counter
-from league.registry.storage.database import Repository, insert, upsert
+from league.registry.storage.database import Database, Repository, insert, upsert
 from league.registry.storage.rows import EarlierGameRow, KeyRow, LeagueRow
 from league.registry.storage.tables import READY, MatchTable, ScheduleTable, VersionTable
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from league.config.league import LeagueConfig
 
 
+Row = TypeVar("Row")
 logger = logging.getLogger(__name__)
 
 
@@ -156,6 +157,13 @@ def require(session: Session, league: str) -> None:
     """Raise UnknownLeague, which lists the known leagues, unless the league is registered."""
     if session.scalar(select(LeagueRow.slug).filter_by(slug=league)) is None:
         _unknown(session, league)
+
+
+def rows(database: Database, league: str, query: Select[Row]) -> list[Row]:
+    """Return the rows of a query about a league, in a transaction of its own. Raises UnknownLeague."""
+    with database.read() as session:
+        require(session, league)
+        return list(session.scalars(query))
 
 
 def lock(session: Session, league: str) -> LeagueRow:

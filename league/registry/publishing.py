@@ -107,8 +107,28 @@ class VersionPublisher(Repository):
                 for member in members
             )
         )
+        first = members[0].manifest
+
+        def build(_: Path, number: int) -> Manifest:
+            return Manifest(
+                league=league,
+                version=number,
+                created_at=datetime.now(UTC),
+                interface=first.interface,
+                policies={},
+                environment=first.environment,
+                environment_digest=first.environment_digest,
+                algorithm=MIXTURE,
+                settings={},
+                seed=0,
+                steps=max(member.steps for member in members),
+                role=MIXTURE,
+                mixture=mixture,
+                stack={},
+            )
+
         source = "mixture/" + ",".join(f"{number}:{probability!r}" for number, probability in probabilities.items())
-        return self.publish(league, lambda _, number: _manifest_of_mixture(number, members, mixture), source=source)
+        return self.publish(league, build, source=source)
 
     def sweep(self, league: str) -> None:
         """Remove what publishers that died have left."""
@@ -136,26 +156,6 @@ def _check_member(member: VersionRow, first: VersionRow, interface_digest: str) 
         raise EnvironmentMismatch(
             f"{first.ref} and {member.ref} were trained in different environments: they cannot be in one mixture"
         )
-
-
-def _manifest_of_mixture(number: int, members: list[VersionRow], mixture: Mixture) -> Manifest:
-    first = members[0].manifest
-    return Manifest(
-        league=first.league,
-        version=number,
-        created_at=datetime.now(UTC),
-        interface=first.interface,
-        policies={},
-        environment=first.environment,
-        environment_digest=first.environment_digest,
-        algorithm=MIXTURE,
-        settings={},
-        seed=0,
-        steps=max(member.steps for member in members),
-        role=MIXTURE,
-        mixture=mixture,
-        stack={},
-    )
 
 
 def reserve(session: Session, league: str, source: str, parent: int | None, above: int) -> int:

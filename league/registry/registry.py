@@ -1,7 +1,6 @@
 """The registry: one repository per aggregate on a shared database and artefact store."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Self
 
@@ -74,15 +73,13 @@ class Registry:
         """Close the database connections."""
         self.database.close()
 
-    @contextmanager
-    def exclusive_lock(self, name: str) -> Iterator[None]:
+    def exclusive_lock(self, name: str) -> AbstractContextManager[None]:
         """Hold a lock across all machines that share the database. Raises AlreadyRunning or StorageError.
 
         The lock is released when the process ends for any reason. If it is lost earlier, because the connection to
         PostgreSQL ends, further changes by this thread raise StorageError.
         """
-        with exclusive_lock.hold(self.database, self.storage.home, name):
-            yield
+        return exclusive_lock.hold(self.database, self.storage.home, name)
 
 
 def artifact_store(storage: Storage) -> ArtifactStore:

@@ -94,9 +94,7 @@ class TrafficRepository(Repository):
     def history(self, league: str) -> list[Traffic]:
         """Return all settings of a league, newest first. Raises UnknownLeague."""
         query = select(TrafficEventTable).filter_by(league=league).order_by(TrafficEventTable.id.desc())
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return [_row(event) for event in session.scalars(query)]
+        return [_row(event) for event in leagues.rows(self._database, league, query)]
 
     def shadow_counts(self, league: str) -> list[ShadowCounts]:
         """Return the shadow counters of a league, summed over replicas, by candidate and champion."""
@@ -143,15 +141,14 @@ def _record(
 def current_setting(session: Session, league: str) -> Traffic:
     """Return the setting in force; without an id if none was ever set. Raises UnknownLeague."""
     leagues.require(session, league)
+    return setting_at(session, league) or Traffic(league=league)
+
+
+def setting_at(session: Session, league: str, newest: int | None = None) -> Traffic | None:
+    """Return the setting that was in force when the setting with the id `newest`, of any league, was the newest; by
+    default the one in force."""
     query = select(TrafficEventTable).filter_by(league=league).order_by(TrafficEventTable.id.desc()).limit(1)
-    event = session.scalar(query)
-    return Traffic(league=league) if event is None else _row(event)
-
-
-def setting_at(session: Session, league: str, newest: int) -> Traffic | None:
-    """Return the setting that was in force when the setting with the id `newest`, of any league, was the newest."""
-    query = select(TrafficEventTable).filter_by(league=league).where(TrafficEventTable.id <= newest)
-    event = session.scalar(query.order_by(TrafficEventTable.id.desc()).limit(1))
+    event = session.scalar(query if newest is None else query.where(TrafficEventTable.id <= newest))
     return None if event is None else _row(event)
 
 

@@ -49,7 +49,7 @@ class VerdictRepository(Repository):
         test: its record, in place of that of the same kind.
         """
         with self._database.write() as session:
-            row = session.get(VerdictRow, verdict, with_for_update=True) or _unknown(verdict)
+            row = _locked(session, verdict)
             if row.outcome is None:
                 tests = [
                     test if (record["kind"], record["schedule"]) == (test["kind"], None) else record
@@ -62,7 +62,7 @@ class VerdictRepository(Repository):
     def close(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
         """Record the outcome of a verdict. Idempotent. Raises UnknownVerdict, or Conflict if it has another outcome."""
         with self._database.write() as session:
-            row = session.get(VerdictRow, verdict, with_for_update=True) or _unknown(verdict)
+            row = _locked(session, verdict)
             if row.outcome is None:
                 row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
             elif row.outcome != outcome:
@@ -76,7 +76,7 @@ class VerdictRepository(Repository):
         Raises UnknownVerdict, or Conflict while its promotion is being applied.
         """
         with self._database.write() as session:
-            row = session.get(VerdictRow, verdict, with_for_update=True) or _unknown(verdict)
+            row = _locked(session, verdict)
             if row.outcome is None:
                 leagues.lock(session, row.league)
                 if session.scalars(select(AliasEvent).filter_by(verdict=verdict)).first() is not None:
@@ -120,9 +120,7 @@ class VerdictRepository(Repository):
     def all(self, league: str) -> list[VerdictRow]:
         """Return all verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
         query = select(VerdictRow).filter_by(league=league).order_by(VerdictRow.opened_at, VerdictRow.id)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return list(session.scalars(query))
+        return leagues.rows(self._database, league, query)
 
     def newest(self, league: str, *, before: str | None = None, limit: int = 20) -> list[VerdictRow]:
         """Return at most `limit` verdicts of a league, newest first.
@@ -186,9 +184,7 @@ class NightlyRunRepository(Repository):
     def all(self, league: str) -> list[NightlyRunRow]:
         """Return all nightly runs of a league, oldest first. Raises UnknownLeague."""
         query = select(NightlyRunRow).filter_by(league=league).order_by(NightlyRunRow.id)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return list(session.scalars(query))
+        return leagues.rows(self._database, league, query)
 
 
 def require_open(session: Session, verdict: str) -> None:
@@ -209,6 +205,10 @@ def _candidates(rows: Sequence[VerdictRow]) -> str:
     ]
     more = f" and {len(rows) - MAX_LISTED} more" if len(rows) > MAX_LISTED else ""
     return ", ".join(listed) + more
+
+
+def _locked(session: Session, verdict: str) -> VerdictRow:
+    return session.get(VerdictRow, verdict, with_for_update=True) or _unknown(verdict)
 
 
 def _unknown(verdict: str) -> VerdictRow:

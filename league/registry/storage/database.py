@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 from filelock import FileLock
 from sqlalchemy import (
+    URL,
     Connection,
     CursorResult,
     Engine,
@@ -154,7 +155,8 @@ class Database:
         # statements; SQLite has a snapshot per transaction.
         self._reading = self.engine if self.is_sqlite else self.engine.execution_options(isolation_level="AUTOCOMMIT")
         self._writing = self.engine.execution_options(writes=True)
-        self._checkouts = _Checkouts(self.engine)
+        self._is_unused = True
+        event.listen(self.engine, "checkout", self._note_use)
         self._of_thread = threading.local()
         try:
             with translate_errors(self.engine):
@@ -220,28 +222,16 @@ class Database:
 
     def close_unused(self) -> None:
         """Close pooled connections to PostgreSQL, each a process there, if none was used since the last call."""
-        if self.engine.dialect.name == "postgresql" and not self._checkouts.reset():
+        is_unused, self._is_unused = self._is_unused, True
+        if self.engine.dialect.name == "postgresql" and is_unused:
             self.engine.dispose()
+
+    def _note_use(self, *_: object) -> None:
+        self._is_unused = False
 
     def close(self) -> None:
         """Close the connections."""
         self.engine.dispose()
-
-
-class _Checkouts:
-    """Counts how often a connection was taken from the pool of an engine."""
-
-    def __init__(self, engine: Engine) -> None:
-        self._number = 0
-        event.listen(engine, "checkout", self._add)
-
-    def reset(self) -> int:
-        """Return the number since the last call."""
-        number, self._number = self._number, 0
-        return number
-
-    def _add(self, *_: object) -> None:
-        self._number += 1
 
 
 _deadline: ContextVar[float | None] = ContextVar("deadline", default=None)
@@ -373,7 +363,7 @@ def _engine(url: str, create: bool, listens: bool) -> Engine:
     if name not in ("sqlite", "postgresql"):
         raise ConfigError(f"LEAGUE_DATABASE_URL names {name!r}: expected sqlite or postgresql")
     if name == "postgresql":
-        return _postgresql(url, listens)
+        return _postgresql(parsed, listens)
     if not parsed.database or parsed.database == ":memory:":
         raise ConfigError(f"LEAGUE_DATABASE_URL {url!r} does not name a file: expected sqlite:////path/to/league.db")
     return _sqlite(url, Path(parsed.database), create)
@@ -423,22 +413,16 @@ def _identity(path: str) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def _postgresql(url: str, listens: bool) -> Engine:
-    parsed = make_url(url)
-    options = " ".join([SESSION_DEFAULTS, *_values(parsed.query.get("options", ()))])
-    query = CONNECTION_DEFAULTS | parsed.query | {"options": options}
-    psycopg = parsed.set(drivername="postgresql+psycopg", query=query)
+def _postgresql(url: URL, listens: bool) -> Engine:
+    options = " ".join([SESSION_DEFAULTS, *url.normalized_query.get("options", ())])
+    query = CONNECTION_DEFAULTS | url.query | {"options": options}
+    psycopg = url.set(drivername="postgresql+psycopg", query=query)
     # A connection that listens is used too often to be tested before each use.
     pool = {"pool_size": 1, "max_overflow": 0} if listens else {"pool_pre_ping": True}
     try:
         return create_engine(psycopg, json_serializer=_strict_json, **pool)
     except ModuleNotFoundError:
         raise ConfigError("PostgreSQL needs a driver: pip install 'policy-league[postgres]'") from None
-
-
-def _values(parameter: str | tuple[str, ...]) -> tuple[str, ...]:
-    """The values of a URL parameter, which may be repeated."""
-    return (parameter,) if isinstance(parameter, str) else parameter
 
 
 def _strict_json(document: Any) -> str:

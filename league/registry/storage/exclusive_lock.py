@@ -5,7 +5,7 @@ With SQLite, all processes run on one machine and share a lock file. With Postgr
 
 import hashlib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -16,16 +16,13 @@ from league.errors import AlreadyRunning, StorageError
 from league.registry.storage.database import Database, translate_errors
 
 
-@contextmanager
-def hold(database: Database, home: Path, name: str) -> Iterator[None]:
+def hold(database: Database, home: Path, name: str) -> AbstractContextManager[None]:
     """Hold the lock `name`. Raises AlreadyRunning if another process holds it, StorageError if locking fails.
 
     If the lock is lost, because the connection to PostgreSQL ends, all further changes by this thread fail with
     StorageError: another process may hold the lock.
     """
-    is_file = database.engine.dialect.name == "sqlite"
-    with _in_file(home, name) if is_file else _in_database(database, name):
-        yield
+    return _in_file(home, name) if database.is_sqlite else _in_database(database, name)
 
 
 @contextmanager

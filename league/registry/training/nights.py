@@ -64,6 +64,4 @@ class TrainingNightRepository(Repository):
     def all(self, league: str) -> list[TrainingNightRow]:
         """Return all nights of a league, oldest first. Raises UnknownLeague."""
         query = select(TrainingNightRow).filter_by(league=league).order_by(TrainingNightRow.id)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return list(session.scalars(query))
+        return leagues.rows(self._database, league, query)

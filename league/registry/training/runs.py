@@ -161,10 +161,8 @@ class RunRepository(Repository):
         query = select(table).filter_by(league=league).order_by(table.began_at.desc(), table.id.desc())
         if run is not None:
             query = query.filter_by(id=run)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            with_records = query.options(undefer(table.record)).where(table.record.is_not(None))
-            return list(session.scalars(with_records.limit(MAX_STORED)))
+        with_records = query.options(undefer(table.record)).where(table.record.is_not(None))
+        return leagues.rows(self._database, league, with_records.limit(MAX_STORED))
 
     def counts(self) -> dict[str, int]:
         """Return league → number of active training runs, of the leagues that have any."""

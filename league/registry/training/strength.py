@@ -42,6 +42,4 @@ class StrengthRepository(Repository):
         """Return the scores of a run's versions, oldest version first. Raises UnknownLeague."""
         table = StrengthRow
         query = select(table).filter_by(league=league, run=run).order_by(table.version, table.at, table.opponent)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return list(session.scalars(query))
+        return leagues.rows(self._database, league, query)
