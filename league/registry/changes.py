@@ -173,8 +173,9 @@ class ChangeRepository(Repository):
                 reasons = []
                 for one in self._replicas.acknowledgements(league):
                     if one.replica in late:
-                        seconds = f"has been silent for {one.silence.total_seconds():.0f} s; last known: "
-                        reasons.append(f"{one.replica} {seconds * (one.silence >= LIVENESS_TIMEOUT)}{describe(one)}")
+                        is_silent = one.silence >= LIVENESS_TIMEOUT
+                        silence = f"has been silent for {one.silence.total_seconds():.0f} s; last known: "
+                        reasons.append(f"{one.replica} {silence if is_silent else ''}{describe(one)}")
                 problem = (
                     f"{len(reasons)} of {registered} replicas have not confirmed it: {'; '.join(reasons)}"
                     if registered

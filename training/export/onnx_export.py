@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -98,18 +99,33 @@ def export_policy(module: PolicyModule, spaces: AgentInterface, path: Path) -> N
         torch.zeros([size or 2 for size in tensor.shape], dtype=_dtype(tensor.dtype)) for tensor in input_tensors
     )
     graph = PolicyGraph(module, tuple(inputs(spaces.observation)), spaces.action).eval()
+    names = [[tensor.name for tensor in tensors] for tensors in (input_tensors, output_tensors)]
+    dynamic_shapes = (tuple({0: torch.export.Dim(BATCH)} for _ in input_tensors),)
+    onnx_program(graph, examples, *names, dynamic_shapes=dynamic_shapes).save(str(path), external_data=False)
+
+
+def onnx_program(
+    module: nn.Module | torch.export.ExportedProgram,
+    examples: tuple[Tensor, ...],
+    inputs: list[str],
+    outputs: list[str],
+    **options: Any,
+) -> torch.onnx.ONNXProgram:
+    """Convert a module to ONNX, without the exporter's messages. Raises what the exporter raises.
+
+    Args:
+        module: The module, or a program that was exported from it.
+        examples: Its arguments.
+        inputs: Names of the graph's inputs.
+        outputs: Names of its outputs.
+        options: Further arguments of `torch.onnx.export`.
+    """
     with quiet():
         program = torch.onnx.export(
-            graph,
-            examples,
-            dynamo=True,
-            input_names=[tensor.name for tensor in input_tensors],
-            output_names=[tensor.name for tensor in output_tensors],
-            dynamic_shapes=(tuple({0: torch.export.Dim(BATCH)} for _ in input_tensors),),
-            verbose=False,
+            module, examples, dynamo=True, input_names=inputs, output_names=outputs, verbose=False, **options
         )
     assert program is not None, "the exporter returns a program unless it is told to write one"
-    program.save(str(path), external_data=False)
+    return program
 
 
 Tensors = tuple[TensorManifest, ...]

@@ -12,7 +12,7 @@ from league.config.league import LeagueConfig
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
-from league.registry.storage.manifest import EXPLOITER, MAIN, PROBES, TRAINING, Manifest, PolicyManifest
+from league.registry.storage.manifest import PROBES, TRAINING, Manifest, PolicyManifest, trained_role
 from league.registry.storage.rows import VersionRow
 from league.stack import installed
 from training.algorithms.rllib_config import module_spec
@@ -116,7 +116,7 @@ def export(
         seed=config.training.seed,
         steps=checkpoint.steps,
         parent=parent,
-        role=MAIN if exploits is None else EXPLOITER,
+        role=trained_role(exploits),
         exploits=exploits,
         git_commit=git_commit,
         stack=installed(),

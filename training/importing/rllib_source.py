@@ -14,10 +14,8 @@ from torch import Tensor, nn
 from league.errors import ConfigError, EnvironmentMismatch, one_line
 from league.interface import AgentInterface
 from league.spaces import ACTION_MASK, OBSERVATION, Box
-from training.importing.adapted_graph import check
-from training.importing.graph_bounds import bounded
 from training.importing.graph_mapping import GraphMapping, InputMapping, Kind
-from training.importing.source import Source
+from training.importing.source import Source, checked
 from training.importing.torch_source import Examples, ModuleOriginal, converted
 
 OUTPUT = "action_dist_inputs"
@@ -78,8 +76,7 @@ def rllib_source(path: Path, module_id: str, spaces: AgentInterface, origin: dic
     kind: Kind = "action" if finished else "gaussian" if isinstance(spaces.action, Box) else "logits"
     mapping = GraphMapping(inputs=inputs, output=OUTPUT, kind=kind)
     model = converted(graph, examples, OUTPUT, where)
-    check(model, mapping, spaces, where)
-    model = bounded(model, mapping, spaces, where)
+    model = checked(model, mapping, spaces, where)
     return Source(model, mapping, ModuleOriginal(graph, examples, mapping, spaces), origin)
 
 

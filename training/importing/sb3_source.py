@@ -12,10 +12,8 @@ from torch import Tensor, nn
 from league.errors import ConfigError, EnvironmentMismatch, one_line
 from league.interface import AgentInterface
 from league.spaces import ACTION_MASK, OBSERVATION, Box, DictSpace, Discrete, inputs
-from training.importing.adapted_graph import check
-from training.importing.graph_bounds import bounded
 from training.importing.graph_mapping import GraphMapping, InputMapping, Kind
-from training.importing.source import Source, State
+from training.importing.source import Source, State, checked
 from training.importing.torch_source import Examples, converted
 
 OUTPUT = "output"
@@ -136,8 +134,7 @@ def sb3_source(path: Path, spaces: AgentInterface, origin: dict[str, Any]) -> So
     )
     examples: Examples = {OBSERVATION: (space.shape, torch.float32)}
     onnx_model = converted(graph.eval(), examples, OUTPUT, str(path))
-    check(onnx_model, mapping, spaces, str(path))
-    onnx_model = bounded(onnx_model, mapping, spaces, str(path))
+    onnx_model = checked(onnx_model, mapping, spaces, str(path))
     return Source(onnx_model, mapping, PredictOriginal(model, graph, mapping, spaces), origin)
 
 

@@ -106,9 +106,16 @@ def onnx_source(path: Path, mapping: Path | None, spaces: AgentInterface, origin
     beside = path.with_suffix(".yaml")
     file = mapping or (beside if beside.exists() else None)
     names = GraphMapping.load(file) if file else inferred(model, spaces, str(path))
-    check(model, names, spaces, str(path))
-    model = bounded(model, names, spaces, str(path))
+    model = checked(model, names, spaces, str(path))
     return Source(model, names, OnnxOriginal(model, names, spaces, str(path)), origin)
+
+
+def checked(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface, source: str) -> onnx.ModelProto:
+    """Return a model whose time and memory are bounded; see `bounded`. Raises EnvironmentMismatch if the mapping does
+    not fit, and InvalidInput.
+    """
+    check(model, mapping, spaces, source)
+    return bounded(model, mapping, spaces, source)
 
 
 def known_logits(logits: NDArray | None, actions: NDArray, spaces: AgentInterface) -> NDArray:

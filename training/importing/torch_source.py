@@ -13,11 +13,10 @@ from torch import Tensor, nn
 from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, one_line
 from league.interface import AgentInterface
 from league.spaces import ACTION_MASK, DictSpace
-from training.export.onnx_export import quiet
-from training.importing.adapted_graph import BATCH, check, decoded
-from training.importing.graph_bounds import bounded
+from training.export.onnx_export import onnx_program
+from training.importing.adapted_graph import BATCH, decoded
 from training.importing.graph_mapping import GraphMapping, inferred
-from training.importing.source import Source, State
+from training.importing.source import Source, State, checked
 
 Examples = dict[str, tuple[tuple[int, ...], torch.dtype]]
 """Input of a module → shape without the batch, and dtype"""
@@ -54,20 +53,11 @@ def converted(module: nn.Module, examples: Examples, output: str, source: str) -
     # Two rows: torch.export treats a batch of one as constant.
     tensors = tuple(torch.zeros((2, *shape), dtype=dtype) for shape, dtype in examples.values())
     try:
-        with quiet():
-            program = torch.onnx.export(
-                module.eval(),
-                tensors,
-                dynamo=True,
-                input_names=list(examples),
-                output_names=[output],
-                dynamic_shapes=tuple({0: torch.export.Dim(BATCH)} for _ in tensors),
-                verbose=False,
-            )
+        dynamic_shapes = tuple({0: torch.export.Dim(BATCH)} for _ in tensors)
+        program = onnx_program(module.eval(), tensors, list(examples), [output], dynamic_shapes=dynamic_shapes)
     except Exception as error:
         cause = one_line(error.__cause__ or error)[:300]
         raise InvalidInput(f"{source}: the model cannot be converted to ONNX: {cause}") from error
-    assert program is not None, "the exporter returns a program unless it is told to write one"
     return program.model_proto
 
 
@@ -97,15 +87,9 @@ def torch_source(path: Path, mapping: Path | None, spaces: AgentInterface, origi
     outputs = program.graph_signature.user_outputs
     if len(outputs) != 1:
         raise EnvironmentMismatch(f"{path}: the program has {len(outputs)} outputs, expected the one that decides")
-    with quiet():
-        exported = torch.onnx.export(
-            program, (), dynamo=True, input_names=names, output_names=["output"], verbose=False
-        )
-    assert exported is not None, "the exporter returns a program unless it is told to write one"
-    model = exported.model_proto
+    model = onnx_program(program, (), names, ["output"]).model_proto
     graph_mapping = GraphMapping.load(mapping) if mapping else inferred(model, spaces, str(path))
-    check(model, graph_mapping, spaces, str(path))
-    model = bounded(model, graph_mapping, spaces, str(path))
+    model = checked(model, graph_mapping, spaces, str(path))
     return Source(
         model, graph_mapping, ModuleOriginal(_Called(program.module()), examples, graph_mapping, spaces), origin
     )

@@ -78,4 +78,4 @@ class PublishQueue:
 def published_versions(registry: Registry, run: RunDirectory) -> list[VersionRow]:
     """Return the versions that a run has published, ascending."""
     rows = registry.versions.all(run.record.config.league)
-    return [row for row in rows if row.source.partition("/")[0] == run.id]
+    return [row for row in rows if row.run == run.id]

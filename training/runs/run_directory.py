@@ -37,7 +37,7 @@ from league.policies.open_inference import fixed_version
 from league.refs import CheckpointRef, RemoteRef, of_league, parse_ref
 from league.registry.processes import host_name, is_local
 from league.registry.registry import Registry
-from league.registry.storage.manifest import EXPLOITER, MAIN, Role
+from league.registry.storage.manifest import MAIN, Role, trained_role
 from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunRow
 from league.registry.training.runs import RUNNING
 from league.settings import Storage
@@ -150,7 +150,7 @@ class RunRecord(BaseModel):
     @property
     def role(self) -> Role:
         """The role of its versions."""
-        return MAIN if self.exploits is None else EXPLOITER
+        return trained_role(self.exploits)
 
 
 class RunDirectory:
@@ -195,11 +195,7 @@ class RunDirectory:
             git_commit=git_commit,
             started_at=started_at,
         )
-        run = cls(path, record)
-        with disk_errors(path):
-            path.mkdir(parents=True, exist_ok=name is not None)
-            run._write()
-        return run
+        return cls._at(path, record, may_exist=name is not None)
 
     @classmethod
     def find(cls, registry: Registry, config: LeagueConfig, name: str) -> Self | None:
@@ -217,7 +213,7 @@ class RunDirectory:
         if not record.complete:
             resources = config.training.model_dump(include=RESOURCES, by_alias=True)
             record = record.model_copy(update={"config": record.config.with_training(**resources)})
-        return cls._copy(path, record)
+        return cls._at(path, record)
 
     @classmethod
     def resume(cls, registry: Registry, config: LeagueConfig, role: Role = MAIN) -> Self:
@@ -256,14 +252,14 @@ class RunDirectory:
                 f"training run {newest.name} is complete: there is nothing to resume, unless --steps or"
                 " --minutes is larger"
             )
-        return cls._copy(newest, record.model_copy(update={"config": config, "complete": False}))
+        return cls._at(newest, record.model_copy(update={"config": config, "complete": False}))
 
     @classmethod
-    def _copy(cls, path: Path, record: RunRecord) -> Self:
-        """Write the record of a run that exists, here or on another machine."""
+    def _at(cls, path: Path, record: RunRecord, *, may_exist: bool = True) -> Self:
+        """Write the record of a run, which may exist, here or on another machine."""
         run = cls(path, record)
         with disk_errors(path):
-            path.mkdir(parents=True, exist_ok=True)
+            path.mkdir(parents=True, exist_ok=may_exist)
             run._write()
         return run
 

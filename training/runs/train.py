@@ -135,7 +135,7 @@ def train(
         with run.locked(), progress, strength:
             with RunReporter(registry, run) as reporter:
                 _describe(config, interface, run, dashboard, progress)
-                _train_and_publish(run, registry, interface, progress, reporter, strength)
+                RunDriver(run, registry, interface, progress, reporter, strength).train()
             strength.join()
     return published_versions(registry, run)
 
@@ -171,33 +171,6 @@ def check(config: LeagueConfig, interface: Interface) -> None:
     module_spec(config.training, interface).build()
 
 
-def _train_and_publish(
-    run: RunDirectory,
-    registry: Registry,
-    interface: Interface,
-    progress: TrainingProgress,
-    reporter: RunReporter,
-    strength: StrengthQueue,
-) -> None:
-    def announce(version: VersionRow) -> None:
-        progress.published(version)
-        strength.add(version)
-
-    publisher = PublishQueue(run, registry, interface, announce)
-    try:
-        _publish_remaining(run, publisher)
-        spent = _attempt(run, interface, registry, publisher, progress, reporter)
-    except Exception:
-        publisher.join()
-        raise
-    publisher.join()
-    if not spent:
-        published = ", ".join(version.ref for version in published_versions(registry, run)) or "nothing yet"
-        how = "To continue: --resume." if OWN_ID.fullmatch(run.id) else "To continue, run the same command again."
-        raise Interrupted(f"Ended early. Published: {published}. TensorBoard: {run.path}. {how}")
-    run.complete()
-
-
 def _target(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interface: Interface) -> str:
     """Return the version that an exploiter is trained against, which must be able to play in the league now."""
     if len(interface.sides) < 2:
@@ -208,124 +181,148 @@ def _target(registry: Registry, ref: CheckpointRef, config: LeagueConfig, interf
     return registry.versions.resolve(ref).ref
 
 
-def _publish_remaining(run: RunDirectory, publisher: PublishQueue) -> None:
-    """Publish the checkpoints of earlier attempts, then delete them."""
-    publisher.join()  # those that are in its queue are removed when they are published
-    for checkpoint in run.checkpoints():
-        publisher.add(checkpoint)
-    publisher.join()
-    run.remove_checkpoints()
+class RunDriver:
+    """Trains one run and publishes its checkpoints. Training continues in a new attempt when nodes come and go."""
 
+    def __init__(
+        self,
+        run: RunDirectory,
+        registry: Registry,
+        interface: Interface,
+        progress: TrainingProgress,
+        reporter: RunReporter,
+        strength: StrengthQueue,
+    ) -> None:
+        """Start the thread that publishes."""
+        self._run, self._registry, self._interface = run, registry, interface
+        self._progress, self._reporter, self._strength = progress, reporter, strength
+        self._publisher = PublishQueue(run, registry, interface, self._announce)
 
-def _start(run: RunDirectory, registry: Registry, private: Path) -> StartState:
-    """Return the state to train from: the run's newest version, otherwise its parent, otherwise none.
-
-    RLlib unpickles it. Therefore it is verified in a private copy, which nobody else can change in between.
-    """
-    parent, league = run.record.parent, run.record.config.league
-    before = run.record.parent_steps
-    published = published_versions(registry, run)
-    if published:
-        state = registry.versions.copy(league, published[-1].number, TRAINING, private)
-        steps, seconds = read_progress(state)
-        return StartState(state, steps, before, seconds)
-    if parent is not None:
-        return StartState(registry.versions.copy(league, parent, TRAINING, private), before, before, 0.0)
-    return FROM_SCRATCH
-
-
-def _attempt(
-    run: RunDirectory,
-    interface: Interface,
-    registry: Registry,
-    publisher: PublishQueue,
-    progress: TrainingProgress,
-    reporter: RunReporter,
-) -> bool:
-    """Train until the budget is spent or a stop is requested; returns which. Continues when nodes come and go."""
-    while True:
-        nodes = node_ids()
+    def train(self) -> None:
+        """Train until the budget is spent. Raises Interrupted, once all is published, if a stop is requested before."""
         try:
-            end = _tune(run, interface, registry, publisher, progress, reporter)
-            if end != "moved":
-                return end == "spent"
-        except LeagueError as error:
-            lost = lost_nodes(nodes, NODE_LOSS_TIMEOUT if is_process_lost(error) and len(nodes) > 1 else 0)
-            if not lost:
-                raise
-            progress.say(f"{len(lost)} of {len(nodes)} nodes were lost ({one_line(error)}). Training continues.")
-        _publish_remaining(run, publisher)
+            self._publish_remaining()
+            spent = self._attempts()
+        except Exception:
+            self._publisher.join()
+            raise
+        self._publisher.join()
+        if not spent:
+            versions = published_versions(self._registry, self._run)
+            published = ", ".join(version.ref for version in versions) or "nothing yet"
+            has_own_id = OWN_ID.fullmatch(self._run.id)
+            how = "To continue: --resume." if has_own_id else "To continue, run the same command again."
+            raise Interrupted(f"Ended early. Published: {published}. TensorBoard: {self._run.path}. {how}")
+        self._run.complete()
 
+    def _announce(self, version: VersionRow) -> None:
+        self._progress.published(version)
+        self._strength.add(version)
 
-def _tune(
-    run: RunDirectory,
-    interface: Interface,
-    registry: Registry,
-    publisher: PublishQueue,
-    progress: TrainingProgress,
-    reporter: RunReporter,
-) -> Literal["spent", "stopped", "moved"]:
-    """Run one attempt as a Tune experiment of one trial. Returns why it ended; `moved`: to continue on other nodes."""
-    config, attempt = run.record.config, run.next_attempt()
-    share = cpu_share(config.training.runners)
-    plan = _plan(run, registry, progress, attempt, share)
-    reporter.begin(plan.start.steps - plan.start.steps_before_run, plan.start.seconds)
+    def _publish_remaining(self) -> None:
+        """Publish the checkpoints of earlier attempts, then delete them."""
+        self._publisher.join()  # those that are in its queue are removed when they are published
+        for checkpoint in self._run.checkpoints():
+            self._publisher.add(checkpoint)
+        self._publisher.join()
+        self._run.remove_checkpoints()
 
-    is_stop_requested = False
+    def _attempts(self) -> bool:
+        """Train until the budget is spent or a stop is requested; returns which."""
+        while True:
+            nodes = node_ids()
+            try:
+                end = self._tune()
+                if end != "moved":
+                    return end == "spent"
+            except LeagueError as error:
+                lost = lost_nodes(nodes, NODE_LOSS_TIMEOUT if is_process_lost(error) and len(nodes) > 1 else 0)
+                if not lost:
+                    raise
+                self._progress.say(
+                    f"{len(lost)} of {len(nodes)} nodes were lost ({one_line(error)}). Training continues."
+                )
+            self._publish_remaining()
 
-    def request_stop() -> None:
-        nonlocal is_stop_requested
-        is_stop_requested = True
-        plan.stop_file.touch()
-        progress.say("Ending after this update, then publishing. Press Ctrl-C again to end immediately.")
+    def _tune(self) -> Literal["spent", "stopped", "moved"]:
+        """Run one attempt as a Tune experiment of one trial. Returns why it ended; `moved`: to continue on other
+        nodes."""
+        run, progress, publisher = self._run, self._progress, self._publisher
+        config, attempt = run.record.config, run.next_attempt()
+        share = cpu_share(config.training.runners)
+        plan = self._plan(attempt, share)
+        self._reporter.begin(plan.start.steps - plan.start.steps_before_run, plan.start.seconds)
 
-    watch = NodeWatch(config.training, share, progress.say, plan.stop_file.touch)
-    tuner = tune.Tuner(
-        tune.with_resources(Trial, placement(config.training, share)),
-        param_space={
-            "league": config.model_dump(mode="json", by_alias=True),
-            "interface": interface.model_dump(mode="json"),
-            "plan": plan,
-        },
-        tune_config=tune.TuneConfig(trial_dirname_creator=lambda _: attempt.name),
-        run_config=run_config(
-            run.path, [_ResultCallback(publisher, progress, reporter), watch], _StopOnPublishError(publisher)
-        ),
-    )
-    try:
-        result = fit(tuner, request_stop)[0]
-    finally:
-        shutil.rmtree(attempt / CHECKPOINTS / START, ignore_errors=True)
-    if result.error is not None:
-        raise training_error(result.error, config.league, attempt / "error.txt") from result.error
-    if (result.metrics or {}).get("spent"):
-        return "spent"
-    if watch.reason is None or is_stop_requested or publisher.error is not None:
-        return "stopped"
-    progress.say(f"{watch.reason[0].upper()}{watch.reason[1:]}. Training continues.")
-    return "moved"
+        is_stop_requested = False
 
+        def request_stop() -> None:
+            nonlocal is_stop_requested
+            is_stop_requested = True
+            plan.stop_file.touch()
+            progress.say("Ending after this update, then publishing. Press Ctrl-C again to end immediately.")
 
-def _plan(run: RunDirectory, registry: Registry, progress: TrainingProgress, attempt: Path, share: float) -> TrialPlan:
-    """Prepare an attempt in its directory. share: CPUs of each of its processes."""
-    config = run.record.config
-    (attempt / CHECKPOINTS).mkdir(parents=True)
-    check_nodes(registry.storage)  # some may have joined meanwhile
-    if (cpus := share * (1 + config.training.runners)) > (available := cluster_cpus()):
-        progress.say(f"Ray's autoscaler is asked for {cpus:g} CPUs; the cluster has {available}.")
-    start = _start(run, registry, attempt / CHECKPOINTS / START)
-    if start.checkpoint is not None and starts_with_empty_replay(config.training, start.checkpoint):
-        progress.say("The replay buffer starts empty: learning begins after training.learning_starts transitions.")
-    return TrialPlan(
-        start,
-        attempt / CHECKPOINTS,
-        attempt / STOP_FILE,
-        registry.storage,
-        cpus=share,
-        run=run.id,
-        parent=run.record.parent,
-        driver=driver_machine(),
-    )
+        watch = NodeWatch(config.training, share, progress.say, plan.stop_file.touch)
+        callbacks = [_ResultCallback(publisher, progress, self._reporter), watch]
+        tuner = tune.Tuner(
+            tune.with_resources(Trial, placement(config.training, share)),
+            param_space={
+                "league": config.model_dump(mode="json", by_alias=True),
+                "interface": self._interface.model_dump(mode="json"),
+                "plan": plan,
+            },
+            tune_config=tune.TuneConfig(trial_dirname_creator=lambda _: attempt.name),
+            run_config=run_config(run.path, callbacks, _StopOnPublishError(publisher)),
+        )
+        try:
+            result = fit(tuner, request_stop)[0]
+        finally:
+            shutil.rmtree(attempt / CHECKPOINTS / START, ignore_errors=True)
+        if result.error is not None:
+            raise training_error(result.error, config.league, attempt / "error.txt") from result.error
+        if (result.metrics or {}).get("spent"):
+            return "spent"
+        if watch.reason is None or is_stop_requested or publisher.error is not None:
+            return "stopped"
+        progress.say(f"{watch.reason[0].upper()}{watch.reason[1:]}. Training continues.")
+        return "moved"
+
+    def _plan(self, attempt: Path, share: float) -> TrialPlan:
+        """Prepare an attempt in its directory. share: CPUs of each of its processes."""
+        config = self._run.record.config
+        (attempt / CHECKPOINTS).mkdir(parents=True)
+        check_nodes(self._registry.storage)  # some may have joined meanwhile
+        if (cpus := share * (1 + config.training.runners)) > (available := cluster_cpus()):
+            self._progress.say(f"Ray's autoscaler is asked for {cpus:g} CPUs; the cluster has {available}.")
+        start = self._start(attempt / CHECKPOINTS / START)
+        if start.checkpoint is not None and starts_with_empty_replay(config.training, start.checkpoint):
+            self._progress.say(
+                "The replay buffer starts empty: learning begins after training.learning_starts transitions."
+            )
+        return TrialPlan(
+            start,
+            attempt / CHECKPOINTS,
+            attempt / STOP_FILE,
+            self._registry.storage,
+            cpus=share,
+            run=self._run.id,
+            parent=self._run.record.parent,
+            driver=driver_machine(),
+        )
+
+    def _start(self, private: Path) -> StartState:
+        """Return the state to train from: the run's newest version, otherwise its parent, otherwise none.
+
+        RLlib unpickles it. Therefore it is verified in a private copy, which nobody else can change in between.
+        """
+        record, versions = self._run.record, self._registry.versions
+        league, before = record.config.league, record.parent_steps
+        if published := published_versions(self._registry, self._run):
+            state = versions.copy(league, published[-1].number, TRAINING, private)
+            steps, seconds = read_progress(state)
+            return StartState(state, steps, before, seconds)
+        if record.parent is not None:
+            return StartState(versions.copy(league, record.parent, TRAINING, private), before, before, 0.0)
+        return FROM_SCRATCH
 
 
 class _ResultCallback(NotPickled, tune.Callback):

@@ -152,7 +152,7 @@ def _conclude(
         TrialReport(number, settings, sweep.outcome(number), errors.get(number))
         for number, settings in enumerate(sweep.record.trials)
     ]
-    sign = 1 if _settings(sweep).mode == "max" else -1
+    sign = 1 if sweep.settings.mode == "max" else -1
     scored = {
         trial.number: sign * trial.score
         for trial in trials
@@ -197,7 +197,7 @@ def _run(
     strength: StrengthTest | None,
 ) -> dict[int, LeagueError]:
     """Train the unfinished trials; return the errors of those that failed."""
-    settings = _settings(sweep)
+    settings = sweep.settings
     numbers = [number for number in range(len(sweep.record.trials)) if sweep.outcome(number) is None]
     if not numbers:
         return {}
@@ -288,8 +288,3 @@ def _publish(sweep: SweepDirectory, number: int, interface: Interface, registry:
         parent=None,
         git_commit=sweep.record.git_commit,
     )
-
-
-def _settings(sweep: SweepDirectory) -> SweepConfig:
-    assert sweep.record.config.sweep is not None
-    return sweep.record.config.sweep

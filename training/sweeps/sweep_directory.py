@@ -20,6 +20,7 @@ from typing import Self
 from pydantic import BaseModel, ConfigDict
 
 from league.config.league import LeagueConfig
+from league.config.sweep import SweepConfig
 from league.errors import ConfigError, NotFound
 from league.files import disk_errors
 from league.settings import Storage
@@ -75,6 +76,12 @@ class SweepDirectory:
     def id(self) -> str:
         """Unique among all sweeps and runs."""
         return f"sweep-{self.path.name}"
+
+    @property
+    def settings(self) -> SweepConfig:
+        """The `sweep` section of the league."""
+        assert self.record.config.sweep is not None
+        return self.record.config.sweep
 
     @property
     def stop_file(self) -> Path:

@@ -26,6 +26,11 @@ MIXTURE: Role = "mixture"
 """The role of a version that consists of other versions with probabilities. It has no policies of its own."""
 
 
+def trained_role(exploits: str | None) -> Role:
+    """Return the role of a trained version. exploits: the version that an exploiter was trained against."""
+    return MAIN if exploits is None else EXPLOITER
+
+
 class _Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 

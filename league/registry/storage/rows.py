@@ -17,7 +17,7 @@ from league.errors import LeagueArchived
 from league.histograms import Histogram
 from league.interface import Interface
 from league.refs import short_verdict
-from league.registry.storage.manifest import EXPLOITER, MAIN, Manifest, Role
+from league.registry.storage.manifest import Manifest, Role, trained_role
 from league.registry.storage.mixture import Mixture
 from league.registry.storage.tables import Base
 
@@ -565,7 +565,7 @@ class RunRow(Record, kw_only=True):
     @property
     def role(self) -> Role:
         """The role of its versions."""
-        return MAIN if self.exploits is None else EXPLOITER
+        return trained_role(self.exploits)
 
 
 class RunPoint(Record):

@@ -127,7 +127,7 @@ def test_an_interrupted_run_says_how_to_continue_it(
     """`league nightly` has no `--resume`."""
     registry.leagues.register(LEAGUE, interface(LEAGUE))
     monkeypatch.setattr("training.runs.train.connected", lambda *_: nullcontext())
-    monkeypatch.setattr("training.runs.train._attempt", lambda *_: False)
+    monkeypatch.setattr("training.runs.train.RunDriver._attempts", lambda *_: False)
     with pytest.raises(Interrupted, match=re.escape(how)):
         train(LEAGUE, registry=registry, name=name, console=Console(quiet=True))
 
