@@ -17,16 +17,19 @@ from league.environments.building import agent_interface, build
 from league.environments.stepping import (
     Batch,
     BatchedEnvironment,
-    CrashLimit,
+    EpisodeStepping,
     Indices,
     NextEpisodes,
     States,
     Turn,
     check_actions,
+    invalid_reward,
     no_envs,
+    picture,
+    without_action,
 )
 from league.environments.vector.vector_env import AgentRows
-from league.errors import EnvironmentMismatch, InvalidReturn, InvalidReward, LeagueError, ObservationError
+from league.errors import InvalidReturn, LeagueError, ObservationError
 from league.spaces import inputs
 from league.spaces.arrays import environment_actions
 
@@ -56,7 +59,7 @@ def stock_stepping(
     return Lockstep(lambda: build(config, render_mode), num_envs, crashes, states)
 
 
-class Lockstep:
+class Lockstep(EpisodeStepping):
     """Implements BatchedEnvironment by a loop over environments.
 
     Episodes of an environment differ only by their seeds. PettingZoo requires `reset` to clear all other state.
@@ -65,7 +68,7 @@ class Lockstep:
     def __init__(self, make: Callable[[], Any], num_envs: int, crashes: int = 0, states: bool = False) -> None:
         self._make, self._gives_states = make, states
         envs = [make() for _ in range(num_envs)]
-        self.agents: tuple[str, ...] = tuple(envs[0].possible_agents)
+        super().__init__(envs[0].possible_agents, num_envs, crashes)
         interfaces = [agent_interface(envs[0], agent) for agent in self.agents]
         self._splits = [splitter(spaces.observation) for spaces in interfaces]
         self._inputs = [inputs(spaces.observation) for spaces in interfaces]
@@ -73,18 +76,7 @@ class Lockstep:
         self._actions = [spaces.action for spaces in interfaces]
         self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
         self._seeds = np.zeros(num_envs, np.int64)
-        self._crashes = CrashLimit(num_envs, crashes)
-        self._groups = np.zeros((num_envs, len(self.agents)), np.int64)
-        self._pending: dict[int, Batch] = {}
-        self._abandoned = no_envs()
-        self._seconds = np.zeros(num_envs)
         self._busy: int | None = None
-        self._since = 0.0
-        self._next_episodes: NextEpisodes
-
-    @property
-    def num_envs(self) -> int:
-        return len(self._envs)
 
     def start(self, next_episodes: NextEpisodes) -> Turn:
         self._next_episodes = next_episodes
@@ -123,14 +115,6 @@ class Lockstep:
         self._abandoned = no_envs()
         return self._continue(turn, reports, free)
 
-    def abandon(self, envs: Indices) -> None:
-        self._abandoned = np.union1d(self._abandoned, envs)
-        kept = {group: batch.rows(batch.without(envs)) for group, batch in self._pending.items()}
-        self._pending = {group: batch for group, batch in kept.items() if len(batch)}
-
-    def assign(self, envs: Indices, groups: Indices) -> None:
-        self._groups[envs] = groups
-
     @property
     def busy(self) -> Indices:
         busy = self._busy
@@ -143,10 +127,7 @@ class Lockstep:
         return seconds
 
     def render(self, env: int, agent: str | None = None) -> NDArray:
-        picture = self._envs[env].render(agent)
-        if picture is None:
-            raise EnvironmentMismatch("the environment cannot be rendered: it does not support render_mode 'rgb_array'")
-        return np.asarray(picture, dtype=np.uint8)
+        return picture(self._envs[env].render(agent))
 
     def close(self) -> None:
         for env in self._envs:
@@ -167,12 +148,9 @@ class Lockstep:
         ]
         acting = {env: [report for report in env_reports if _must_act(report)] for env, env_reports in reports.items()}
         if len(free):
-            starts = self._next_episodes(free)
-            self._groups[starts.envs] = starts.groups
-            self._seconds[starts.envs] = 0.0
-            # Some environments store the seed as a signed 32-bit integer.
-            self._seeds[starts.envs] = starts.seeds % 2**31
-            acting |= {env: self._reset(env) for env in starts.envs.tolist()}
+            starting, seeds = self._starts(free)
+            self._seeds[starting] = seeds
+            acting |= {env: self._reset(env) for env in starting.tolist()}
         rows = [(env, report) for env in sorted(acting) for report in acting[env]]
         turn.states = self._states(sorted(env for env, env_reports in acting.items() if env_reports))
         blocks: dict[int, list[tuple[int, Report]]] = defaultdict(list)
@@ -195,7 +173,7 @@ class Lockstep:
                 self._crash(env, error)
         reports = [report for report in reports if _must_act(report)]
         if not reports:
-            raise EnvironmentMismatch(f"the episode with seed {self._seeds[env]} ends at its reset, without an action")
+            raise without_action(int(self._seeds[env]))
         self._check_rewards(env, reports)
         return reports
 
@@ -205,10 +183,7 @@ class Lockstep:
     def _check_rewards(self, env: int, reports: Sequence[Report]) -> None:
         for agent, _, reward, _, _ in reports:
             if not math.isfinite(reward):
-                raise InvalidReward(
-                    f"agent {self.agents[agent]} got a reward of {reward} in the episode with seed {self._seeds[env]},"
-                    " expected a finite number"
-                )
+                raise invalid_reward(self.agents[agent], reward, int(self._seeds[env]))
 
     def _crash(self, env: int, error: Exception) -> None:
         """Recreate an environment, or raise the error after too many crashes."""

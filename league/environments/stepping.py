@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.vector.vector_env import AgentRows
-from league.errors import IllegalAction, one_line
+from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward, one_line
 from league.spaces import ACTION_MASK, Box, Discrete, MultiBinary, MultiDiscrete, Space
+from league.spaces.arrays import bounds
 
 logger = logging.getLogger(__name__)
 
@@ -204,6 +205,63 @@ class BatchedEnvironment(Protocol):
         """Close the environments."""
 
 
+class EpisodeStepping:
+    """What the implementations of BatchedEnvironment have in common: groups, abandoned episodes, times and crashes.
+
+    Attributes:
+        agents: See BatchedEnvironment.
+        num_envs: See BatchedEnvironment.
+    """
+
+    def __init__(self, agents: Sequence[str], num_envs: int, crashes: int) -> None:
+        self.agents: tuple[str, ...] = tuple(agents)
+        self.num_envs = num_envs
+        self._groups = np.zeros((num_envs, len(agents)), np.int64)
+        self._crashes = CrashLimit(num_envs, crashes)
+        self._pending: dict[int, Batch] = {}
+        self._abandoned = no_envs()
+        self._seconds = np.zeros(num_envs)
+        self._since = 0.0
+        self._next_episodes: NextEpisodes
+
+    def abandon(self, envs: Indices) -> None:
+        """See BatchedEnvironment."""
+        self._abandoned = np.union1d(self._abandoned, envs)
+        kept = {group: batch.rows(batch.without(envs)) for group, batch in self._pending.items()}
+        self._pending = {group: batch for group, batch in kept.items() if len(batch)}
+
+    def assign(self, envs: Indices, groups: Indices) -> None:
+        """See BatchedEnvironment."""
+        self._groups[envs] = groups
+
+    def _starts(self, free: Indices) -> tuple[Indices, Indices]:
+        """Return the environments among `free` ones whose next episodes start, and the seeds of their resets."""
+        starts = self._next_episodes(free)
+        self._groups[starts.envs] = starts.groups
+        self._seconds[starts.envs] = 0.0
+        # Some environments store the seed as a signed 32-bit integer.
+        return starts.envs, starts.seeds % 2**31
+
+
+def picture(rendered: Any) -> NDArray[np.uint8]:
+    """Return what `render` has returned as an array. Raises EnvironmentMismatch if it is None."""
+    if rendered is None:
+        raise EnvironmentMismatch("the environment cannot be rendered: it does not support render_mode 'rgb_array'")
+    return np.asarray(rendered, dtype=np.uint8)
+
+
+def without_action(seed: int) -> EnvironmentMismatch:
+    """Return the error for an episode in which no agent must act."""
+    return EnvironmentMismatch(f"the episode with seed {seed} ends at its reset, without an action")
+
+
+def invalid_reward(agent: str, reward: float, seed: int) -> InvalidReward:
+    """Return the error for a reward that is not finite."""
+    return InvalidReward(
+        f"agent {agent} got a reward of {reward} in the episode with seed {seed}, expected a finite number"
+    )
+
+
 ROUNDING = 1e-5
 """Relative tolerance for actions at the bounds of a Box."""
 
@@ -247,7 +305,7 @@ def legal_rows(actions: NDArray, space: Space, mask: NDArray | None) -> NDArray:
                 inside &= mask[np.arange(len(mask))[:, np.newaxis], first + np.where(inside, indices, 0)] != 0
             return inside.all(axis=1)
         case Box():
-            low, high = _bound(space.low, -np.inf), _bound(space.high, np.inf)
+            low, high = bounds(space)
             inside = (actions >= low - ROUNDING * (1 + np.abs(low))) & (actions <= high + ROUNDING * (1 + np.abs(high)))
             return (inside & np.isfinite(actions)).reshape(len(actions), -1).all(axis=1)
         case MultiBinary():
@@ -261,11 +319,6 @@ def allows_nothing(mask: NDArray, space: Space) -> NDArray:
         return ~(mask != 0).any(axis=1)
     choices = np.asarray(space.nvec).ravel()
     return (np.add.reduceat(mask != 0, np.cumsum(choices) - choices, axis=1, dtype=int) == 0).any(axis=1)
-
-
-def _bound(bound: Any, infinite: float) -> NDArray:
-    values = np.array(bound, dtype=np.float64)
-    return np.where(np.isnan(values), infinite, values)
 
 
 class CrashLimit:

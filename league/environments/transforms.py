@@ -145,8 +145,10 @@ def transform(
         case "color_reduction_v0":
             grey = channel(**kwargs) or (lambda rows: (rows.astype(np.float32) @ GRAYSCALE_WEIGHTS).astype(np.uint8))
             return Stateless(grey)
-        case "resize_v1":
-            return _resize(space, **kwargs)
+        case "resize_v1" if (
+            kwargs.get("linear_interp", True) and min(space.shape[:2]) >= 2 and space.dtype in (np.uint8, np.float32)
+        ):
+            return Resize(space.shape[0], space.shape[1], kwargs["y_size"], kwargs["x_size"])
         case "frame_stack_v1" if kwargs.get("stack_dim", -1) == -1:
             return FrameStack(num_envs * len(agents), space, kwargs.get("stack_size", 4))
         case "agent_indicator_v0":
@@ -163,17 +165,7 @@ def transform(
         case "reshape_v0":
             return Stateless(lambda rows: rows.reshape(len(rows), *kwargs["shape"]))
         case "normalize_obs_v0":
-            return _normalize(space, **kwargs)
+            low, size, to_low = space.low, space.high - space.low, float(kwargs.get("env_min", 0.0))
+            to_size = float(kwargs.get("env_max", 1.0)) - to_low
+            return Stateless(lambda rows: (rows - low) / size * to_size + to_low)
     return None
-
-
-def _resize(space: spaces.Box, x_size: int, y_size: int, linear_interp: bool = True) -> Resize | None:
-    if not linear_interp or min(space.shape[:2]) < 2 or space.dtype not in (np.uint8, np.float32):
-        return None
-    height, width = space.shape[:2]
-    return Resize(height, width, y_size, x_size)
-
-
-def _normalize(space: spaces.Box, env_min: float = 0.0, env_max: float = 1.0) -> Stateless:
-    low, size, to_low, to_size = space.low, space.high - space.low, float(env_min), float(env_max) - float(env_min)
-    return Stateless(lambda rows: (rows - low) / size * to_size + to_low)

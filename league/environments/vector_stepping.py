@@ -14,20 +14,23 @@ from league.environments.building import agent_interface, build
 from league.environments.episode_replay import EpisodeActions, StepActions
 from league.environments.stepping import (
     Batch,
-    CrashLimit,
+    EpisodeStepping,
     Indices,
     NextEpisodes,
     States,
     Turn,
     check_actions,
+    invalid_reward,
     no_envs,
+    picture,
+    without_action,
 )
 from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.errors import EnvironmentMismatch, InvalidReward, LeagueError, one_line
+from league.errors import EnvironmentMismatch, LeagueError, one_line
 from league.spaces import inputs
 
 
-class VectorStepping:
+class VectorStepping(EpisodeStepping):
     """Implements BatchedEnvironment by a vectorised environment.
 
     If the vectorised environment raises, the episodes in progress are replayed in stock environments. Those that raise
@@ -52,9 +55,8 @@ class VectorStepping:
         self._vector = make(num_envs)
         if fast_seeds:
             self._vector.use_fast_seeds()
-        self.num_envs = num_envs
         with closing(build(config)) as stock:
-            self.agents: tuple[str, ...] = tuple(stock.possible_agents)
+            super().__init__(stock.possible_agents, num_envs, crashes)
             interfaces = [agent_interface(stock, agent) for agent in self.agents]
         if self._vector.possible_agents != self.agents:
             raise EnvironmentMismatch(
@@ -67,13 +69,7 @@ class VectorStepping:
         self._episodes = EpisodeActions(num_envs)
         self._plays = np.zeros(num_envs, dtype=bool)
         """Which environments have an episode."""
-        self._groups = np.zeros((num_envs, len(self.agents)), np.int64)
-        self._crashes = CrashLimit(num_envs, crashes)
-        self._seconds = np.zeros(num_envs)
-        self._busy, self._since = no_envs(), 0.0
-        self._pending: dict[int, Batch] = {}
-        self._abandoned = no_envs()
-        self._next_episodes: NextEpisodes
+        self._busy = no_envs()
 
     def start(self, next_episodes: NextEpisodes) -> Turn:
         self._next_episodes = next_episodes
@@ -101,14 +97,6 @@ class VectorStepping:
         free.sort()
         return self._continue(turn, rows, free)
 
-    def abandon(self, envs: Indices) -> None:
-        self._abandoned = np.union1d(self._abandoned, envs)
-        kept = {group: batch.rows(batch.without(envs)) for group, batch in self._pending.items()}
-        self._pending = {group: batch for group, batch in kept.items() if len(batch)}
-
-    def assign(self, envs: Indices, groups: Indices) -> None:
-        self._groups[envs] = groups
-
     @property
     def busy(self) -> Indices:
         return self._busy
@@ -122,10 +110,7 @@ class VectorStepping:
         if self._has_fast_seeds:
             raise EnvironmentMismatch("the environment cannot be rendered with fast seeds")
         with closing(self._episodes.in_stock(self._config, env, render_mode="rgb_array")) as stock:
-            picture = stock.render(agent)
-        if picture is None:
-            raise EnvironmentMismatch("the environment cannot be rendered: it does not support render_mode 'rgb_array'")
-        return np.asarray(picture, dtype=np.uint8)
+            return picture(stock.render(agent))
 
     def close(self) -> None:
         """Do nothing: stock environments are closed after each use."""
@@ -164,20 +149,16 @@ class VectorStepping:
                 self._renew(np.flatnonzero(self._plays))
         self._plays[envs] = self._acts(rows)[envs]
         if len(over := envs[~self._plays[envs]]):
-            seed = self._episodes.seed(int(over[0]))
-            raise EnvironmentMismatch(f"the episode with seed {seed} ends at its reset, without an action")
+            raise without_action(self._episodes.seed(int(over[0])))
         self._check_rewards(rows)
         return rows
 
     def _continue(self, turn: Turn, rows: Sequence[AgentRows], free: Indices) -> Turn:
         """Start the next episodes of free environments, and report who must act."""
         if len(free):
-            starts = self._next_episodes(free)
-            if len(starts.envs):
-                self._groups[starts.envs] = starts.groups
-                self._seconds[starts.envs] = 0.0
-                # As in lockstep: some environments store the seed as a signed 32-bit integer.
-                rows = [*rows, *self._reset(starts.envs, starts.seeds % 2**31)]
+            starting, seeds = self._starts(free)
+            if len(starting):
+                rows = [*rows, *self._reset(starting, seeds)]
         turn.states = self._states(np.flatnonzero(self._plays))
         turn.batches = self._pending = self._batches(rows)
         return turn
@@ -234,10 +215,8 @@ class VectorStepping:
         for block in rows:
             if not (is_finite := np.isfinite(block.rewards)).all():
                 row = int(np.argmin(is_finite))
-                raise InvalidReward(
-                    f"agent {self.agents[block.agents[row]]} got a reward of {block.rewards[row]} in the episode with"
-                    f" seed {self._episodes.seed(int(block.envs[row]))}, expected a finite number"
-                )
+                seed = self._episodes.seed(int(block.envs[row]))
+                raise invalid_reward(self.agents[block.agents[row]], block.rewards[row], seed)
 
     def _batches(self, rows: Sequence[AgentRows]) -> dict[int, Batch]:
         """Return the rows of all agents that must act, by ascending group."""

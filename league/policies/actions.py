@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from league.errors import ConfigError, IllegalMask
 from league.spaces import Box, Discrete, MultiDiscrete, Space
+from league.spaces.arrays import bounds
 
 
 def dist_inputs_size(space: Space) -> int:
@@ -53,11 +54,6 @@ def to_environment(raw: NDArray, space: Space) -> NDArray:
     raise ConfigError(f"unsupported action space {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
 
 
-def bounds(space: Box) -> tuple[NDArray, NDArray]:
-    """Return lower and upper bounds, (*shape) float64; infinite if missing."""
-    return _bound(space.low, -np.inf, space.shape), _bound(space.high, np.inf, space.shape)
-
-
 def _spanned(raw: NDArray, low: NDArray, high: NDArray, largest: float) -> NDArray:
     """largest: maximum of the dtype, which keeps unbounded values finite."""
     clipped = np.clip(raw, np.maximum(low, -largest), np.minimum(high, largest))
@@ -68,12 +64,6 @@ def _spanned(raw: NDArray, low: NDArray, high: NDArray, largest: float) -> NDArr
     # A weighted mean of the bounds: `high - low` may overflow.
     spanned = np.where(finite, low, 0) * (1 - share) + np.where(finite, high, 0) * share
     return np.where(finite, np.clip(spanned, low, high), clipped)
-
-
-def _bound(bound: object, infinity: float, shape: tuple[int, ...]) -> NDArray:
-    # None becomes NaN in a float array; bounds contain no other NaN.
-    values = np.array(bound, dtype=np.float64)
-    return np.broadcast_to(np.where(np.isnan(values), infinity, values), shape)
 
 
 def check_legal_action(mask: NDArray) -> None:

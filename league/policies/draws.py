@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import ConfigError, InvalidInput
-from league.policies.actions import bounds
 from league.spaces import Box, Discrete, MultiDiscrete, Space
+from league.spaces.arrays import bounds
 
 Generators = Sequence[np.random.Generator]
 
@@ -139,7 +139,9 @@ def probabilities(dist_inputs: NDArray, space: Space, mask: NDArray | None = Non
             ]
             return [[part[row].tolist() for part in parts] for row in range(len(dist_inputs))]
         case Box(shape=shape):
-            means, deviations = _gaussian(dist_inputs.astype(np.float64), space)
+            raw_means, log_deviations = np.split(dist_inputs.astype(np.float64), 2, axis=1)
+            centre, half = _range(space)
+            means, deviations = centre + raw_means * half, np.exp(log_deviations) * half
             pairs = zip(means.reshape(-1, *shape), deviations.reshape(-1, *shape), strict=True)
             return [{"mean": mean.tolist(), "std": deviation.tolist()} for mean, deviation in pairs]
     raise ConfigError(f"unsupported action space {space!r}")
@@ -183,13 +185,6 @@ def _shares(logits: NDArray, mask: NDArray | None) -> NDArray:
         logits = np.where(mask != 0, logits, -np.inf)
     weights = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
     return weights / weights.sum(axis=1, keepdims=True)
-
-
-def _gaussian(dist_inputs: NDArray, space: Box) -> tuple[NDArray, NDArray]:
-    """Means and standard deviations (k, m) in the units of the space; see `to_environment`."""
-    means, log_deviations = np.split(dist_inputs, 2, axis=1)
-    centre, half = _range(space)
-    return centre + means * half, np.exp(log_deviations) * half
 
 
 def _range(space: Box) -> tuple[NDArray, NDArray]:

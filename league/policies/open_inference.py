@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from league.errors import ConfigError, EnvironmentMismatch, RemoteError
 from league.interface import AgentInterface, Interface, digest
-from league.policies.actions import bounds
 from league.policies.draws import Generators
 from league.policies.open_inference_signature import DATATYPES, RemoteSignature, read_signature
 from league.policies.policy import Actions, Arrays, MalformedAction
 from league.refs import RemoteRef
 from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete, inputs
+from league.spaces.arrays import bounds
 from policy_league_client import Client
 from policy_league_client.calls import ApiCall
 from policy_league_client.requests import JsonObject, to_json

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import ArtifactCorrupt, ObservationError, one_line
-from league.policies.actions import bounds
 from league.policies.draws import elements
 from league.policies.onnx import ACTION, STATE_IN, OnnxPolicy
 from league.spaces import Box, MultiDiscrete, Space
+from league.spaces.arrays import bounds
 
 NEAR_TIE = 1e-5
 """Maximum difference of two logits whose order may depend on the runtime's order of summation."""

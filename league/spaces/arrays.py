@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import IllegalMask, ObservationError
-from league.spaces import Discrete, Leaf, MultiBinary, MultiDiscrete, Space, leaf_paths, paths
+from league.spaces import Box, Discrete, Leaf, MultiBinary, MultiDiscrete, Space, leaf_paths, paths
 
 
 def tensors(space: Space, value: Any) -> dict[str, NDArray]:
@@ -71,6 +71,14 @@ def mask_size(action: Space) -> int | None:
         case MultiDiscrete(nvec=nvec):
             return int(np.sum(nvec))
     return None
+
+
+def bounds(space: Box) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return lower and upper bounds, (*shape) float64; infinite if missing."""
+    # None becomes NaN in a float array; bounds contain no other NaN.
+    low, high = (np.array(bound, dtype=np.float64) for bound in (space.low, space.high))
+    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    return np.broadcast_to(low, space.shape), np.broadcast_to(high, space.shape)
 
 
 def environment_actions(actions: NDArray, space: Space) -> list[Any]:

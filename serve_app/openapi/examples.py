@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from league.policies.actions import bounds
 from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space, inputs
-from league.spaces.arrays import nested
+from league.spaces.arrays import bounds, nested
 from serve_app.inference_protocol.tensors import datatype_of
 from serve_app.live_versions.version_cache import LoadedPolicy
 

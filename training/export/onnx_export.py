@@ -13,10 +13,11 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from league.interface import AgentInterface
-from league.policies.actions import bounds, dist_inputs_size
+from league.policies.actions import dist_inputs_size
 from league.policies.onnx import ACTION, DIST_INPUTS, LAST_ACTION, STATE_IN, STATE_OUT
 from league.registry.storage.manifest import Tensor as TensorManifest
 from league.spaces import Box, DictSpace, Discrete, MultiDiscrete, Space, inputs
+from league.spaces.arrays import bounds
 from training.modules.policy_module import PREVIOUS_ACTION, PolicyModule
 
 BATCH = "batch"
@@ -107,8 +108,8 @@ def export_policy(module: PolicyModule, spaces: AgentInterface, path: Path) -> N
 def onnx_program(
     module: nn.Module | torch.export.ExportedProgram,
     examples: tuple[Tensor, ...],
-    inputs: list[str],
-    outputs: list[str],
+    input_names: list[str],
+    output_names: list[str],
     **options: Any,
 ) -> torch.onnx.ONNXProgram:
     """Convert a module to ONNX, without the exporter's messages. Raises what the exporter raises.
@@ -116,13 +117,13 @@ def onnx_program(
     Args:
         module: The module, or a program that was exported from it.
         examples: Its arguments.
-        inputs: Names of the graph's inputs.
-        outputs: Names of its outputs.
+        input_names: Names of the graph's inputs.
+        output_names: Names of its outputs.
         options: Further arguments of `torch.onnx.export`.
     """
     with quiet():
         program = torch.onnx.export(
-            module, examples, dynamo=True, input_names=inputs, output_names=outputs, verbose=False, **options
+            module, examples, dynamo=True, input_names=input_names, output_names=output_names, verbose=False, **options
         )
     assert program is not None, "the exporter returns a program unless it is told to write one"
     return program

@@ -9,11 +9,12 @@ from onnx import NodeProto, ValueInfoProto, compose, helper, numpy_helper, versi
 
 from league.errors import EnvironmentMismatch, one_line
 from league.interface import AgentInterface
-from league.policies.actions import bounds, dist_inputs_size, to_environment
+from league.policies.actions import dist_inputs_size, to_environment
 from league.policies.draws import elements
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.registry.storage.manifest import Tensor
 from league.spaces import ACTION_MASK, Box, DictSpace, Discrete, Leaf, MultiDiscrete, inputs
+from league.spaces.arrays import bounds
 from training.importing.graph_mapping import GraphMapping, InputMapping, graph_inputs, tensors
 
 OPSET = 18

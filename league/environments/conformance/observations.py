@@ -12,7 +12,7 @@ from league.environments.building import agent_interface, observation_space
 from league.environments.conformance.findings import Examination, Trace
 from league.errors import EnvironmentMismatch, InvalidReturn
 from league.spaces import ACTION_MASK, Box, Leaf, inputs
-from league.spaces.arrays import tensors
+from league.spaces.arrays import bounds, tensors
 
 ENOUGH_TURNS = 20
 """Minimum turns of an agent for the check that its observations change."""
@@ -92,16 +92,12 @@ def _example_outside(leaves: Mapping[str, Leaf], arrays: Observation) -> str:
     for name, leaf in leaves.items():
         if not isinstance(leaf, Box) or np.shape(arrays[name]) != leaf.shape:
             continue
-        low, high = _bound(leaf, leaf.low, -np.inf), _bound(leaf, leaf.high, np.inf)
+        low, high = bounds(leaf)
         array = np.asarray(arrays[name], np.float64)
         for index in map(tuple, np.argwhere((array < low) | (array > high))[:1].tolist()):
             place = f"{name}[{', '.join(map(str, index))}]"
             return f"{place} is {array[index]:g}, outside of [{low[index]:g}, {high[index]:g}]"
     return ""
-
-
-def _bound(leaf: Box, bound: Any, infinite: float) -> NDArray[np.float64]:
-    return np.broadcast_to(np.asarray(infinite if bound is None else bound, np.float64), leaf.shape)
 
 
 def check_constant_observations(traces: Sequence[Trace], env: Any, found: Examination) -> None:

@@ -14,7 +14,7 @@ from league.environments.adapters import EnvAdapter, Observation, Report
 from league.environments.conformance.random_actions import RandomActions
 from league.environments.conformance.time_budget import TimeBudget
 from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space
-from league.spaces.arrays import environment_actions
+from league.spaces.arrays import bounds, environment_actions
 
 SEEDS = 20
 """Games of deterministic play that are compared."""
@@ -217,9 +217,7 @@ def joined(observation: Observation) -> bytes:
 def _first(space: Space, mask: NDArray[Any] | None) -> Any:
     """Return the first legal action, or the value of a Box that is nearest to 0."""
     if isinstance(space, Box):
-        # An infinite bound becomes NaN, which fmax and fmin ignore.
-        low, high = (np.array(bound, np.float64) for bound in (space.low, space.high))
-        action = np.fmin(np.fmax(np.zeros(space.shape), low), high)
+        action = np.clip(np.zeros(space.shape), *bounds(space))
     else:
         assert isinstance(space, Discrete | MultiDiscrete), "other actions are a fault, and no game is played"
         choices = np.ravel(space.nvec if isinstance(space, MultiDiscrete) else space.n)

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
+from league.spaces.arrays import bounds
 
 AT_A_BOUND = 0.1
 """Share of the elements of a bounded Box that are drawn at a bound."""
@@ -39,12 +40,12 @@ def random_choices(mask: NDArray, rng: np.random.Generator) -> NDArray[np.int64]
 
 
 def _in_box(space: Box, count: int, rng: np.random.Generator) -> NDArray:
-    low, high = (np.broadcast_to(np.array(bound, dtype=np.float64), space.shape) for bound in (space.low, space.high))
+    low, high = bounds(space)
     bounded = np.isfinite(low) & np.isfinite(high)
     share = rng.random((count, *space.shape))
     # A weighted mean of the bounds: `high - low` may overflow.
     drawn = np.where(bounded, low, 0) * (1 - share) + np.where(bounded, high, 0) * share
     at_bound = np.where(rng.random(drawn.shape) < 0.5, low, high)
     drawn = np.where(rng.random(drawn.shape) < AT_A_BOUND, at_bound, drawn)
-    near = np.clip(rng.normal(size=drawn.shape), np.nan_to_num(low, nan=-np.inf), np.nan_to_num(high, nan=np.inf))
+    near = np.clip(rng.normal(size=drawn.shape), low, high)
     return np.where(bounded, drawn, near).astype(space.dtype)

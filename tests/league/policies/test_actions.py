@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from league.errors import ConfigError
-from league.policies.actions import bounds, dist_inputs_size, to_environment
+from league.policies.actions import dist_inputs_size, to_environment
 from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
+from league.spaces.arrays import bounds
 from league.spaces.conversion import from_gymnasium, to_gymnasium
 
 PAIRS = MultiDiscrete(nvec=[[2, 3], [4, 5]], start=[[0, 1], [2, 3]], shape=(2, 2))
