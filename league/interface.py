@@ -4,24 +4,19 @@ import hashlib
 import json
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
-
+from league.frozen import FrozenModel
 from league.spaces import Space
 
 
-class AgentInterface(BaseModel):
+class AgentInterface(FrozenModel):
     """The spaces of one agent."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     observation: Space
     action: Space
 
 
-class Interface(BaseModel):
+class Interface(FrozenModel):
     """Agents of an environment in the order of `possible_agents`, with their policies and sides."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     agents: dict[str, AgentInterface]
     policies: dict[str, str]

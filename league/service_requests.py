@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, RootModel, Tag, model_validator
+from pydantic import Discriminator, Field, RootModel, Tag, model_validator
+
+from league.frozen import FrozenModel
 
 MOST_CONTESTANTS = 256
 MOST_BLOCKS = 100_000
@@ -18,8 +20,7 @@ MOST_NUMBER = 2**31 - 1
 """Largest number of a game or a step."""
 
 
-class _Request(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+class _Request(FrozenModel, strict=True): ...
 
 
 class _WithReason(_Request):
@@ -187,10 +188,6 @@ class GameRequest(_Request):
         return not isinstance(self.operation, PlayabilityRequest)
 
 
-class _Document(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
 Chances = Annotated[
     tuple[tuple[int, Annotated[float, Field(ge=0, le=1)]], ...],
     Field(
@@ -204,7 +201,7 @@ ActionNames = Annotated[dict[str, str], Field(description="Name by action, a num
 Picture = Annotated[str | None, Field(description="The picture after the step: a PNG as a data URI, or null.")]
 
 
-class RecordedMove(_Document):
+class RecordedMove(FrozenModel):
     """What an agent did in a step."""
 
     agent: str
@@ -213,7 +210,7 @@ class RecordedMove(_Document):
     chances: Chances
 
 
-class RecordedStep(_Document):
+class RecordedStep(FrozenModel):
     """A step of a game."""
 
     step: int = Field(ge=0)
@@ -224,7 +221,7 @@ class RecordedStep(_Document):
     opening: bool = Field(description="Whether the step is part of the random opening.")
 
 
-class GameForfeit(_Document):
+class GameForfeit(FrozenModel):
     """An agent that returned no valid action; the game ends there."""
 
     agent: str
@@ -232,7 +229,7 @@ class GameForfeit(_Document):
     reason: Literal["illegal_action", "not_finite", "malformed", "crashed"]
 
 
-class RecordedGame(_Document):
+class RecordedGame(FrozenModel):
     """A recorded game. If it cannot be replayed, `fault` is set and there are no steps."""
 
     match: str
@@ -249,7 +246,7 @@ class RecordedGame(_Document):
     fault: str | None = Field(description="The reason why the game cannot be replayed.")
 
 
-class PlayableAgent(_Document):
+class PlayableAgent(FrozenModel):
     """An agent that a person can control: its actions are the `actions` integers from `start`."""
 
     agent: str
@@ -266,7 +263,7 @@ class PlayableAgent(_Document):
     )
 
 
-class Playability(_Document):
+class Playability(FrozenModel):
     """The agents and opponents for a game with a person, or the reason why the league is not playable."""
 
     league: str
@@ -291,7 +288,7 @@ class Playability(_Document):
     )
 
 
-class PlayedGame(_Document):
+class PlayedGame(FrozenModel):
     """The game of a person so far, and the legal actions."""
 
     opponent: str = Field(description="The requested opponent; an alias is replaced by its version.")

@@ -3,18 +3,17 @@
 from typing import Annotated, Any
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator
 
 from league.errors import InvalidReference
+from league.frozen import FrozenModel
 from league.refs import of_league, parse_ref
 
 JSON = dict[str, Any]
 
 
-class Part(BaseModel):
-    """Base of configuration models: frozen, rejects unknown keys and non-finite numbers."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class Part(FrozenModel, allow_inf_nan=False):
+    """Base of configuration models, which rejects non-finite numbers too."""
 
 
 class UniqueKeyLoader(yaml.SafeLoader):

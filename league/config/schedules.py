@@ -72,16 +72,12 @@ def scheduled_value(value: Scheduled, progress: ScheduleProgress) -> float:
     """Return the current value of a setting that is a number or a schedule."""
     if isinstance(value, AnnealingConfig):
         return value.at(progress)
-    if isinstance(value, tuple):
-        return _interpolated(value, progress.steps)
-    return value
-
-
-def _interpolated(points: Points, steps: int) -> float:
-    before = [point for point in points if point[0] <= steps]
-    after = [point for point in points if point[0] > steps]
+    if not isinstance(value, tuple):
+        return value
+    before = [point for point in value if point[0] <= progress.steps]
+    after = [point for point in value if point[0] > progress.steps]
     if not before or not after:
         return (before[-1] if before else after[0])[1]
     (first, low), (second, high) = before[-1], after[0]
-    share = (steps - first) / (second - first)
+    share = (progress.steps - first) / (second - first)
     return (1 - share) * low + share * high

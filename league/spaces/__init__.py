@@ -18,17 +18,15 @@ serving replica handles arrays without Gymnasium.
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from league.frozen import FrozenModel
 
 OBSERVATION = "observation"
 ACTION_MASK = "action_mask"
 
 
-class _Space(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Box(_Space):
+class Box(FrozenModel):
     """An array of numbers. A bound is a number if all elements share it, else nested lists; None means infinite."""
 
     type: Literal["box"] = "box"
@@ -38,7 +36,7 @@ class Box(_Space):
     high: Any
 
 
-class Discrete(_Space):
+class Discrete(FrozenModel):
     """An integer in [start, start + n)."""
 
     type: Literal["discrete"] = "discrete"
@@ -51,7 +49,7 @@ class Discrete(_Space):
         return ()
 
 
-class MultiDiscrete(_Space):
+class MultiDiscrete(FrozenModel):
     """An array of integers, element i in [start_i, start_i + nvec_i)."""
 
     type: Literal["multi_discrete"] = "multi_discrete"
@@ -61,7 +59,7 @@ class MultiDiscrete(_Space):
     dtype: str = "int64"
 
 
-class MultiBinary(_Space):
+class MultiBinary(FrozenModel):
     """An array of zeros and ones."""
 
     type: Literal["multi_binary"] = "multi_binary"
@@ -69,7 +67,7 @@ class MultiBinary(_Space):
     dtype: str = "int8"
 
 
-class DictSpace(_Space):
+class DictSpace(FrozenModel):
     """Named spaces.
 
     maskable: whether a key `action_mask` is the mask of the actions. Otherwise it is observed like any other.

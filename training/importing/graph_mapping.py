@@ -6,10 +6,11 @@ from typing import Any, Literal, Self
 import onnx
 import yaml
 from onnx.helper import tensor_dtype_to_np_dtype
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from league.config.validation_errors import describe_validation_error, describe_yaml_error
 from league.errors import ConfigError, EnvironmentMismatch
+from league.frozen import FrozenModel
 from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
 from league.spaces import ACTION_MASK, Box, DictSpace, inputs
@@ -17,10 +18,8 @@ from league.spaces import ACTION_MASK, Box, DictSpace, inputs
 Kind = Literal["logits", "values", "gaussian", "action"]
 
 
-class InputMapping(BaseModel):
+class InputMapping(FrozenModel):
     """What an input of a graph receives."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     """`observation`, `observation.<key>` or `action_mask`."""
@@ -44,10 +43,8 @@ class InputMapping(BaseModel):
         return tuple(shape[axis] for axis in self.transpose) if self.transpose else shape
 
 
-class GraphMapping(BaseModel):
+class GraphMapping(FrozenModel):
     """Names of a graph's tensors and the meaning of its output."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     inputs: dict[str, InputMapping]
     """Input of the graph → what it receives."""
@@ -58,7 +55,7 @@ class GraphMapping(BaseModel):
     action in the units of the action space."""
     units: Literal["normalized", "environment"] = "normalized"
     """Units of a Gaussian for actions with bounds: [-1, 1] stands for the bounds, or the units of the action space."""
-    state: dict[str, str] = {}
+    state: dict[str, str] = Field(default={})
     """Recurrent input → the output with its next value."""
 
     @classmethod

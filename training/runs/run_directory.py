@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from league.config.base import JSON, Part
 from league.config.league import LeagueConfig
@@ -31,6 +31,7 @@ from league.config.ppo import PPOConfig
 from league.config.validation_errors import describe_validation_error
 from league.errors import AlreadyRunning, ConfigError, NotFound, RunCorrupt
 from league.files import disk_errors, replacing
+from league.frozen import FrozenModel
 from league.interface import Interface
 from league.policies.loading import contestant, players
 from league.policies.open_inference import fixed_version
@@ -129,14 +130,12 @@ RESUMABLE_SETTINGS = {"steps", "minutes", "checkpoint_every", "checkpoint_minute
 `exploiter` are those of other runs; in an exploiter's own run they have replaced those of the league."""
 
 
-class RunRecord(BaseModel):
+class RunRecord(FrozenModel):
     """The content of run.json."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     config: LeagueConfig
     """The league, with pinned opponents."""
-    pins: dict[str, str] = {}
+    pins: dict[str, str] = Field(default={})
     """Opponents as the user wrote them → what they resolved to when the run began."""
     parent: int | None
     parent_steps: int = 0

@@ -17,12 +17,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict
-
 from league.config.league import LeagueConfig
 from league.config.sweep import SweepConfig
 from league.errors import ConfigError, NotFound
 from league.files import disk_errors
+from league.frozen import FrozenModel
 from league.settings import Storage
 from training.runs.run_directory import CHECKPOINTS, STOP_FILE, changed_setting, locked, with_pins, write
 from training.sweeps.search_space import Settings, applied
@@ -31,10 +30,8 @@ SWEEP_FILE = "sweep.json"
 OUTCOME_FILE = "outcome.json"
 
 
-class SweepRecord(BaseModel):
+class SweepRecord(FrozenModel):
     """The content of sweep.json. See RunRecord."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     config: LeagueConfig
     pins: dict[str, str]
@@ -47,14 +44,12 @@ class SweepRecord(BaseModel):
     complete: bool = False
 
 
-class TrialOutcome(BaseModel):
+class TrialOutcome(FrozenModel, allow_inf_nan=False):
     """The result of a trial.
 
     score: the mean metric of its last reports, or its last strength; None without values. low, high: the bounds of the
     strength's 95 % interval.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     score: float | None
     low: float | None = None

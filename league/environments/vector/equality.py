@@ -6,6 +6,7 @@ Everything that the two report must be equal bit for bit.
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -121,7 +122,7 @@ class DifferentialTest:
         self._vector, self.num_envs = vector, vector.num_envs
         stock = [build(config) for _ in range(self.num_envs)]
         self._agents = _agents(stock[0])
-        splits = [_splitter(agent.observation) for agent in self._agents]
+        splits = [partial(tensors, agent.observation) for agent in self._agents]
         self._stock = [adapter_for(env, splits) for env in stock]
         self._seeds, self._steps = np.zeros((2, self.num_envs), dtype=np.int64)
         self._must_act = np.zeros((self.num_envs, len(self._agents)), dtype=bool)
@@ -262,10 +263,6 @@ def _agents(env: Any) -> list[_Agent]:
             spaces.append(interface.observation)
         agents.append(_Agent(name, interface.observation, interface.action, spaces.index(interface.observation)))
     return agents
-
-
-def _splitter(space: Space) -> Callable[[Any], dict[str, NDArray]]:
-    return lambda value: tensors(space, value)
 
 
 def _columns(space: Space, reports: Sequence[tuple[int, Report]]) -> AgentRows:

@@ -28,7 +28,15 @@ def random_actions(space: Space, count: int, mask: NDArray | None, rng: np.rando
             low, high = (np.array(bound, dtype) for bound in (space.low, space.high))
             return rng.integers(low, high, (count, *space.shape), dtype, endpoint=True)
         case Box():
-            return _in_box(space, count, rng)
+            low, high = bounds(space)
+            bounded = np.isfinite(low) & np.isfinite(high)
+            share = rng.random((count, *space.shape))
+            # A weighted mean of the bounds: `high - low` may overflow.
+            drawn = np.where(bounded, low, 0) * (1 - share) + np.where(bounded, high, 0) * share
+            at_bound = np.where(rng.random(drawn.shape) < 0.5, low, high)
+            drawn = np.where(rng.random(drawn.shape) < AT_A_BOUND, at_bound, drawn)
+            near = np.clip(rng.normal(size=drawn.shape), low, high)
+            return np.where(bounded, drawn, near).astype(space.dtype)
     raise TypeError(f"random actions of a {type(space).__name__} are not supported")
 
 
@@ -37,15 +45,3 @@ def random_choices(mask: NDArray, rng: np.random.Generator) -> NDArray[np.int64]
     allowed = np.cumsum(mask != 0, axis=1, dtype=np.int32)
     choice = (rng.random(len(mask)) * allowed[:, -1]).astype(np.int32)
     return (allowed > choice[:, np.newaxis]).argmax(axis=1)
-
-
-def _in_box(space: Box, count: int, rng: np.random.Generator) -> NDArray:
-    low, high = bounds(space)
-    bounded = np.isfinite(low) & np.isfinite(high)
-    share = rng.random((count, *space.shape))
-    # A weighted mean of the bounds: `high - low` may overflow.
-    drawn = np.where(bounded, low, 0) * (1 - share) + np.where(bounded, high, 0) * share
-    at_bound = np.where(rng.random(drawn.shape) < 0.5, low, high)
-    drawn = np.where(rng.random(drawn.shape) < AT_A_BOUND, at_bound, drawn)
-    near = np.clip(rng.normal(size=drawn.shape), low, high)
-    return np.where(bounded, drawn, near).astype(space.dtype)

@@ -60,22 +60,20 @@ class BatchedMinimax:
         wins = (self._completing(own) & moves) != 0
         value = np.where(wins, plies, 0).astype(np.int8)
         rows = np.flatnonzero(~wins & (moves != 0))
-        if plies > 1 and len(rows):
-            value[rows] = self._best_reply(own[rows], other[rows], moves[rows], plies)
-        return value
-
-    def _best_reply(self, own: Bitboards, other: Bitboards, moves: Bitboards, plies: int) -> NDArray[np.int8]:
-        """Return the value of the best move of positions without a winning one. Only a move that prevents the
-        opponent's immediate win can be better than losing at once."""
+        if plies == 1 or not len(rows):
+            return value
+        own, other, moves = own[rows], other[rows], moves[rows]
+        # Only a move that prevents the opponent's immediate win can be better than losing at once.
         threats = self._completing(other) & moves
         candidates = np.where(threats != 0, threats, moves)
-        best = np.full(len(own), LOST, np.int8)
+        best = np.full(len(rows), LOST, np.int8)
         for squares in self._reached:
             move = candidates & squares
-            rows = np.flatnonzero(move)
-            value = -self._value(other[rows], (own | move)[rows], plies - 1)
-            best[rows] = np.maximum(best[rows], value)
-        return best
+            moving = np.flatnonzero(move)
+            replies = -self._value(other[moving], (own | move)[moving], plies - 1)
+            best[moving] = np.maximum(best[moving], replies)
+        value[rows] = best
+        return value
 
     def _moves(self, taken: Bitboards) -> Bitboards:
         """Return the squares that can be taken: the empty ones, with gravity the lowest empty one of each column."""

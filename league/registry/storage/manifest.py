@@ -2,12 +2,13 @@
 
 from typing import Any, Literal, Self
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AwareDatetime, Field, ValidationError, model_validator
 
 from league.conditions import VALUE_BASED
 from league.config.environment import EnvironmentConfig
 from league.config.validation_errors import describe_validation_error
 from league.errors import ArtifactCorrupt
+from league.frozen import FrozenModel
 from league.interface import Interface
 from league.registry.storage.mixture import Mixture
 from league.spaces import Space
@@ -31,11 +32,7 @@ def trained_role(exploits: str | None) -> Role:
     return MAIN if exploits is None else EXPLOITER
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Tensor(_Record):
+class Tensor(FrozenModel):
     """An input or output of a graph. The batch dimension is None."""
 
     name: str
@@ -43,7 +40,7 @@ class Tensor(_Record):
     shape: tuple[int | None, ...]
 
 
-class Parity(_Record):
+class Parity(FrozenModel):
     """Result of comparing a graph with the trained module."""
 
     observations: int
@@ -56,7 +53,7 @@ class Parity(_Record):
     """Maximum absolute difference of the distribution inputs."""
 
 
-class PolicyManifest(_Record):
+class PolicyManifest(FrozenModel):
     """A policy: an ONNX graph that contains its weights."""
 
     file: str
@@ -71,7 +68,7 @@ class PolicyManifest(_Record):
     """File of the probes (policies/probes.py) that are checked before serving; None if there are none."""
 
 
-class Manifest(_Record):
+class Manifest(FrozenModel):
     """The description of a version: environment, policies, origin and the digest of each file."""
 
     league: str

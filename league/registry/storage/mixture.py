@@ -11,18 +11,17 @@ from functools import cached_property
 from itertools import accumulate
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from league.errors import InvalidInput
+from league.frozen import FrozenModel
 
 TOLERANCE = 1e-3
 """By which the probabilities that a user writes may differ from 1 in total: three thirds are written as 0.333."""
 
 
-class Member(BaseModel):
+class Member(FrozenModel):
     """A version of a mixture."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     version: int = Field(ge=1)
     probability: float = Field(gt=0, le=1)
@@ -30,10 +29,8 @@ class Member(BaseModel):
     """Digest of the version's manifest.json."""
 
 
-class Mixture(BaseModel):
+class Mixture(FrozenModel, ignored_types=(cached_property,)):
     """Versions with probabilities that sum to 1, by number."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", ignored_types=(cached_property,))
 
     members: tuple[Member, ...] = Field(min_length=2)
 

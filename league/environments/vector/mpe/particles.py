@@ -111,32 +111,25 @@ class Physics:
         """Move the particles, in place. forces: of the agents' actions, (agents, 2, n) float64; overwritten."""
         positions, velocities = particles.positions, particles.velocities
         if self._pairs:
-            self._add_collisions(positions, forces)
+            deltas = positions.take(self._first, axis=0) - positions.take(self._second, axis=0)
+            distances = lengths(deltas)
+            exponents = -(distances - self._contacts) / CONTACT_MARGIN
+            penetrations = np.zeros_like(distances)
+            # The others are exactly 0.
+            near = exponents > UNDERFLOW
+            penetrations[near] = np.logaddexp(0, exponents[near]) * CONTACT_MARGIN
+            repulsions = CONTACT_FORCE * deltas / distances[:, np.newaxis] * penetrations[:, np.newaxis]
+            # Sums are rounded in the order of the pairs.
+            for (a, b), repulsion in zip(self._pairs, repulsions, strict=True):
+                forces[a] += repulsion
+                if b < len(forces):
+                    forces[b] -= repulsion
         positions[: len(velocities)] += velocities * TIME_STEP
         velocities *= 1 - DAMPING
         forces *= TIME_STEP
         velocities += forces
         if self._max_speeds.size:
-            self._limit_speeds(velocities)
-
-    def _add_collisions(self, positions: NDArray[np.float64], forces: NDArray[np.float64]) -> None:
-        deltas = positions.take(self._first, axis=0) - positions.take(self._second, axis=0)
-        distances = lengths(deltas)
-        exponents = -(distances - self._contacts) / CONTACT_MARGIN
-        penetrations = np.zeros_like(distances)
-        # The others are exactly 0.
-        near = exponents > UNDERFLOW
-        penetrations[near] = np.logaddexp(0, exponents[near]) * CONTACT_MARGIN
-        repulsions = CONTACT_FORCE * deltas / distances[:, np.newaxis] * penetrations[:, np.newaxis]
-        # Sums are rounded in the order of the pairs.
-        for (a, b), repulsion in zip(self._pairs, repulsions, strict=True):
-            forces[a] += repulsion
-            if b < len(forces):
-                forces[b] -= repulsion
-
-    def _limit_speeds(self, velocities: NDArray[np.float64]) -> None:
-        speeds = lengths(velocities)
-        agents, envs = np.nonzero(speeds > self._max_speeds)
-        velocities[agents, :, envs] = (
-            velocities[agents, :, envs] / speeds[agents, envs, np.newaxis] * self._max_speeds[agents]
-        )
+            speeds = lengths(velocities)
+            agents, envs = np.nonzero(speeds > self._max_speeds)
+            limited = velocities[agents, :, envs] / speeds[agents, envs, np.newaxis] * self._max_speeds[agents]
+            velocities[agents, :, envs] = limited
