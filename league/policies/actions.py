@@ -49,21 +49,17 @@ def to_environment(raw: NDArray, space: Space) -> NDArray:
         case MultiDiscrete(start=start, shape=shape, dtype=dtype):
             return (raw.reshape(-1, *shape) + np.asarray(start)).astype(dtype)
         case Box(shape=shape, dtype=dtype) if np.dtype(dtype).kind == "f":
-            wide, largest = raw.reshape(-1, *shape).astype(np.float64), float(np.finfo(dtype).max)
-            return _spanned(wide, *bounds(space), largest).astype(dtype)
+            wide, (low, high) = raw.reshape(-1, *shape).astype(np.float64), bounds(space)
+            largest = float(np.finfo(dtype).max)  # keeps unbounded values finite
+            clipped = np.clip(wide, np.maximum(low, -largest), np.minimum(high, largest))
+            finite = np.isfinite(low) & np.isfinite(high)
+            if not finite.any():
+                return clipped.astype(dtype)
+            share = (np.clip(wide, -1, 1) + 1) / 2
+            # A weighted mean of the bounds: `high - low` may overflow.
+            spanned = np.where(finite, low, 0) * (1 - share) + np.where(finite, high, 0) * share
+            return np.where(finite, np.clip(spanned, low, high), clipped).astype(dtype)
     raise ConfigError(f"unsupported action space {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
-
-
-def _spanned(raw: NDArray, low: NDArray, high: NDArray, largest: float) -> NDArray:
-    """largest: maximum of the dtype, which keeps unbounded values finite."""
-    clipped = np.clip(raw, np.maximum(low, -largest), np.minimum(high, largest))
-    finite = np.isfinite(low) & np.isfinite(high)
-    if not finite.any():
-        return clipped
-    share = (np.clip(raw, -1, 1) + 1) / 2
-    # A weighted mean of the bounds: `high - low` may overflow.
-    spanned = np.where(finite, low, 0) * (1 - share) + np.where(finite, high, 0) * share
-    return np.where(finite, np.clip(spanned, low, high), clipped)
 
 
 def check_legal_action(mask: NDArray) -> None:

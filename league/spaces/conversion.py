@@ -18,48 +18,42 @@ def from_gymnasium(space: gymnasium.Space[Any]) -> Space:
     """Convert a Gymnasium space. Raises EnvironmentMismatch for unsupported kinds (Text, Graph, …), and without values
     or with too many choices.
     """
-    converted = _converted(space)
-    if isinstance(converted, DictSpace):
-        _check_names(converted)
-    elif 0 in converted.shape:
+    converted: Space
+    match space:
+        case gymnasium.spaces.Box():
+            converted = Box(dtype=space.dtype.name, shape=space.shape, low=_bound(space.low), high=_bound(space.high))
+        case gymnasium.spaces.Discrete():
+            converted = Discrete(n=int(space.n), start=int(space.start), dtype=np.dtype(space.dtype).name)
+        case gymnasium.spaces.MultiDiscrete():
+            nvec, start, dtype = space.nvec.tolist(), space.start.tolist(), np.dtype(space.dtype).name
+            converted = MultiDiscrete(nvec=nvec, start=start, shape=space.shape, dtype=dtype)
+        case gymnasium.spaces.MultiBinary():
+            converted = MultiBinary(shape=space.shape)
+        case gymnasium.spaces.Dict():
+            return _dict_from_gymnasium(space)
+        case _:
+            raise EnvironmentMismatch(
+                f"space {space} is not supported: expected Box, Discrete, MultiDiscrete, MultiBinary or Dict"
+            )
+    if 0 in converted.shape:
         raise EnvironmentMismatch(f"space {space} has no elements: expected at least one")
     if (choices := mask_size(converted) or 0) > MAX_CHOICES:
         raise EnvironmentMismatch(f"space {space} has {choices:,} choices: expected at most {MAX_CHOICES:,}")
     return converted
 
 
-def _check_names(space: DictSpace) -> None:
-    """Raise EnvironmentMismatch for a Dict without keys, or one whose leaves do not have different names."""
+def _dict_from_gymnasium(space: gymnasium.spaces.Dict) -> DictSpace:
+    """Convert a Dict, whose leaves must have different names."""
+    if not_text := [key for key in space.spaces if not isinstance(key, str)]:
+        raise EnvironmentMismatch(f"a Dict has the key {not_text[0]!r}: expected a string")
     if not space.spaces:
         raise EnvironmentMismatch("a Dict without keys is not supported: remove it")
-    names = [name for name, *_ in leaf_paths(space)]
+    converted = DictSpace(spaces={key: from_gymnasium(part) for key, part in space.spaces.items()})
+    names = [name for name, *_ in leaf_paths(converted)]
     if len(set(names)) < len(names):
         name = next(name for name in names if names.count(name) > 1)
         raise EnvironmentMismatch(f"two parts of an observation would have the name {name!r}: rename a key")
-
-
-def _converted(space: gymnasium.Space[Any]) -> Space:
-    match space:
-        case gymnasium.spaces.Box():
-            return Box(dtype=space.dtype.name, shape=space.shape, low=_bound(space.low), high=_bound(space.high))
-        case gymnasium.spaces.Discrete():
-            return Discrete(n=int(space.n), start=int(space.start), dtype=np.dtype(space.dtype).name)
-        case gymnasium.spaces.MultiDiscrete():
-            return MultiDiscrete(
-                nvec=space.nvec.tolist(),
-                start=space.start.tolist(),
-                shape=space.shape,
-                dtype=np.dtype(space.dtype).name,
-            )
-        case gymnasium.spaces.MultiBinary():
-            return MultiBinary(shape=space.shape)
-        case gymnasium.spaces.Dict():
-            if not_text := [key for key in space.spaces if not isinstance(key, str)]:
-                raise EnvironmentMismatch(f"a Dict has the key {not_text[0]!r}: expected a string")
-            return DictSpace(spaces={key: from_gymnasium(part) for key, part in space.spaces.items()})
-    raise EnvironmentMismatch(
-        f"space {space} is not supported: expected Box, Discrete, MultiDiscrete, MultiBinary or Dict"
-    )
+    return converted
 
 
 def with_mask(observation: Space, action: Space) -> Space:

@@ -36,38 +36,29 @@ def start_version(
 ) -> CheckpointRef | None:
     """Return the version that a run of a night or a gate starts from, None for one that starts from scratch.
 
+    An exploiter starts from `parent` or from scratch: if that was imported, has another network than `config` defines,
+    or its training state was removed. The training of a night starts from `parent`, or if that was imported, from the
+    newest version of its league that can be trained further.
+
     Args:
         registry: The registry of the league.
         parent: The version that it continues if that can be trained further.
         config: The settings of the run.
         target: The version that an exploiter is trained against.
     """
-    return start_of_night(registry, parent) if target is None else start_of_exploiter(registry, parent, config)
-
-
-def start_of_exploiter(registry: Registry, ref: CheckpointRef, config: LeagueConfig) -> CheckpointRef | None:
-    """Return the version that an exploiter starts from: `ref`, or None if that cannot be trained further.
-
-    It was imported, has another network than `config` defines, or its training state was removed.
-    """
-    version = registry.versions.resolve(ref)
-    try:
-        check_network(version, config.against(version.ref))
-    except ConfigError:
-        return None
-    return ref if registry.versions.has_training(version) else None
-
-
-def start_of_night(registry: Registry, ref: CheckpointRef) -> CheckpointRef | None:
-    """Return the version that a night's training starts from: `ref`, or if that was imported, the newest version of its
-    league that can be trained further. None if there is none.
-    """
-    if registry.versions.resolve(ref).manifest.algorithm in ALGORITHMS:
-        return ref
-    for version in reversed(registry.versions.all(ref.league)):
-        trained = version.exploits is None and version.manifest.algorithm in ALGORITHMS
-        if trained and registry.versions.has_training(version):
-            return CheckpointRef(version.league, version.number)
+    version = registry.versions.resolve(parent)
+    if target is not None:
+        try:
+            check_network(version, config.against(version.ref))
+        except ConfigError:
+            return None
+        return parent if registry.versions.has_training(version) else None
+    if version.manifest.algorithm in ALGORITHMS:
+        return parent
+    for other in reversed(registry.versions.all(parent.league)):
+        trained = other.exploits is None and other.manifest.algorithm in ALGORITHMS
+        if trained and registry.versions.has_training(other):
+            return CheckpointRef(other.league, other.number)
     return None
 
 

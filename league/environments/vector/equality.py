@@ -229,17 +229,17 @@ class DifferentialTest:
         where = RowNames(names, self._seeds.copy(), self._steps.copy())
         for stock, vector in zip(expected, blocks, strict=True):
             check_rows(stock, vector, where)
-        self._earlier.append(lambda: self._check_unchanged(expected, blocks, where))
+
+        def check_unchanged() -> None:
+            try:
+                for stock, vector in zip(expected, blocks, strict=True):
+                    check_rows(stock, vector, where)
+            except EnvironmentsDiffer as difference:
+                raise EnvironmentsDiffer(f"{difference} (changed after it was reported)") from None
+
+        self._earlier.append(check_unchanged)
         if len(self._earlier) > KEPT:
             self._earlier.popleft()()
-
-    @staticmethod
-    def _check_unchanged(expected: list[AgentRows], found: list[AgentRows], where: RowNames) -> None:
-        try:
-            for stock, vector in zip(expected, found, strict=True):
-                check_rows(stock, vector, where)
-        except EnvironmentsDiffer as difference:
-            raise EnvironmentsDiffer(f"{difference} (changed after it was reported)") from None
 
     def _check_states(self, env_ids: NDArray[np.int64]) -> None:
         states, vector = [self._stock[env].state() for env in env_ids], self._vector.state(env_ids.copy())

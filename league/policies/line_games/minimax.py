@@ -62,15 +62,15 @@ class BatchedMinimax:
         rows = np.flatnonzero(~wins & (moves != 0))
         if plies == 1 or not len(rows):
             return value
-        own, other, moves = own[rows], other[rows], moves[rows]
+        players, opponents = own[rows], other[rows]
         # Only a move that prevents the opponent's immediate win can be better than losing at once.
-        threats = self._completing(other) & moves
-        candidates = np.where(threats != 0, threats, moves)
+        threats = self._completing(opponents) & moves[rows]
+        candidates = np.where(threats != 0, threats, moves[rows])
         best = np.full(len(rows), LOST, np.int8)
         for squares in self._reached:
             move = candidates & squares
             moving = np.flatnonzero(move)
-            replies = -self._value(other[moving], (own | move)[moving], plies - 1)
+            replies = -self._value(opponents[moving], (players | move)[moving], plies - 1)
             best[moving] = np.maximum(best[moving], replies)
         value[rows] = best
         return value

@@ -226,12 +226,12 @@ class Database:
         if self.engine.dialect.name == "postgresql" and is_unused:
             self.engine.dispose()
 
-    def _note_use(self, *_: object) -> None:
-        self._is_unused = False
-
     def close(self) -> None:
         """Close the connections."""
         self.engine.dispose()
+
+    def _note_use(self, *_: object) -> None:
+        self._is_unused = False
 
 
 _deadline: ContextVar[float | None] = ContextVar("deadline", default=None)
@@ -375,34 +375,36 @@ def _sqlite(url: str, path: Path, create: bool) -> Engine:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             path.touch(mode=0o600)  # it contains digests of API keys; SQLite gives its other files the same mode
     engine = create_engine(url, json_serializer=_strict_json, connect_args={"timeout": BUSY_TIMEOUT_SECONDS})
-    event.listen(engine, "do_connect", _open_existing)
     event.listen(engine, "connect", _prepare_sqlite)
-    event.listen(engine, "checkout", _check_file)
-    event.listen(engine, "begin", _begin_sqlite)
+
+    @event.listens_for(engine, "do_connect")
+    def open_existing(_: object, record: ConnectionPoolEntry, arguments: list[Any], options: dict[str, Any]) -> None:
+        # A file created while the database is moved away would be mistaken for it and mixed with its write-ahead log.
+        path = arguments[0]
+        record.info[FILE] = path, _identity(path)
+        if record.info[FILE][1] is None:
+            raise StorageError(f"the database {path} does not exist")
+        arguments[0] = f"file:{quote(path)}?mode=rw"
+        options["uri"] = True
+
+    @event.listens_for(engine, "checkout")
+    def check_file(_: object, record: ConnectionPoolEntry, __: object) -> None:
+        # A connection keeps its file open if that is moved or replaced.
+        path, opened = record.info[FILE]
+        if _identity(path) != opened:
+            raise DisconnectionError(f"{path} was replaced by another file")
+
+    @event.listens_for(engine, "begin")
+    def begin(connection: Connection) -> None:
+        if not connection.get_execution_options().get("writes", False):
+            connection.exec_driver_sql("BEGIN")
+            return
+        deadline = _deadline.get()
+        timeout = 1000 * BUSY_TIMEOUT_SECONDS if deadline is None else _milliseconds_until(deadline)
+        connection.exec_driver_sql(f"PRAGMA busy_timeout = {timeout}")
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+
     return engine
-
-
-def _open_existing(
-    _: object, record: ConnectionPoolEntry, arguments: list[Any], options: dict[str, Any]
-) -> sqlite3.Connection | None:
-    """Open the database without creating it.
-
-    A file created while the database is moved away would be mistaken for it and mixed with its write-ahead log.
-    """
-    path = arguments[0]
-    record.info[FILE] = path, _identity(path)
-    if record.info[FILE][1] is None:
-        raise StorageError(f"the database {path} does not exist")
-    arguments[0] = f"file:{quote(path)}?mode=rw"
-    options["uri"] = True
-    return None
-
-
-def _check_file(_: object, record: ConnectionPoolEntry, __: object) -> None:
-    """Reconnect if the database file was moved or replaced, because a connection keeps its old file open."""
-    path, opened = record.info[FILE]
-    if _identity(path) != opened:
-        raise DisconnectionError(f"{path} was replaced by another file")
 
 
 def _identity(path: str) -> tuple[int, int] | None:
@@ -434,13 +436,3 @@ def _prepare_sqlite(connection: sqlite3.Connection, _: object) -> None:
     # The driver begins transactions at the first write, which is too late to read under the lock.
     connection.isolation_level = None
     connection.execute("PRAGMA foreign_keys = ON")
-
-
-def _begin_sqlite(connection: Connection) -> None:
-    if not connection.get_execution_options().get("writes", False):
-        connection.exec_driver_sql("BEGIN")
-        return
-    deadline = _deadline.get()
-    timeout = 1000 * BUSY_TIMEOUT_SECONDS if deadline is None else _milliseconds_until(deadline)
-    connection.exec_driver_sql(f"PRAGMA busy_timeout = {timeout}")
-    connection.exec_driver_sql("BEGIN IMMEDIATE")

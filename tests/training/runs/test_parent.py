@@ -13,7 +13,7 @@ from league.registry.storage.manifest import EXPLOITER, Manifest
 from league.settings import Storage
 from tests.support.leagues import registries
 from tests.support.leagues.registries import LEAGUE
-from training.runs.parent import check_network, start_of_night
+from training.runs.parent import check_network, start_version
 
 
 @pytest.fixture
@@ -34,16 +34,16 @@ def publish(registry: Registry, **manifest: Any) -> CheckpointRef:
 def test_a_version_that_was_trained_continues(registry: Registry) -> None:
     first = publish(registry)
     publish(registry)
-    assert start_of_night(registry, first) == first
+    assert start_version(registry, first, registries.config(), None) == first
 
 
 def test_in_place_of_an_imported_version_the_newest_one_continues(registry: Registry) -> None:
     imported = publish(registry, algorithm="imported")
-    assert start_of_night(registry, imported) is None
+    assert start_version(registry, imported, registries.config(), None) is None
     trained = publish(registry)
     publish(registry, role=EXPLOITER, exploits=str(imported))
     publish(registry, algorithm="imported")
-    assert start_of_night(registry, imported) == trained
+    assert start_version(registry, imported, registries.config(), None) == trained
 
 
 @pytest.mark.parametrize(
