@@ -28,6 +28,7 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.tune.experiment import Trial
 from ray.tune.logger.tensorboardx import TBXLoggerCallback
+from ray.tune.search.variant_generator import generate_variants as generate_variants
 
 from league.errors import ConfigError
 

@@ -9,12 +9,12 @@ import math
 from typing import Any
 
 from ray import tune
-from ray.tune.search.variant_generator import generate_variants
 
 from league.config.league import LeagueConfig
 from league.config.sweep import SweepConfig
 from league.errors import ConfigError
 from league.random.seeds import generator
+from training.rllib_compat import generate_variants
 
 Settings = dict[str, Any]
 """Training setting, with dots for nested ones (`per_policy.cars.lr`) → value."""
