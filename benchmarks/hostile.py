@@ -44,7 +44,7 @@ def _unauthenticated(calls: int) -> Iterator[Target]:
     (grpc_port,) = free_ports(1, "127.0.0.1")
     with served(grpc_port=grpc_port, replicas=REPLICAS) as (url, registry):
         registry.keys.create("caller", ["act"])
-        yield from unauthenticated(url, f"127.0.0.1:{grpc_port}", calls)
+        yield from unauthenticated(url, f"127.0.0.1:{grpc_port}", calls, registry.storage.home)
 
 
 def _bodies(seconds: float, pairs: int) -> Iterator[Target]:

@@ -86,6 +86,7 @@ def test_a_promotion_fails_if_the_champion_has_changed(tab: Tab, served: Served)
     page = tab.open(f"{L}/versions")
     page.get_by_role("button", name=re.compile("^API key")).click()
     enter_key(page, served.keys["everything"])
+    expect(page.get_by_role("dialog")).to_have_count(0)  # the page is loaded anew
     page.get_by_role("button", name=f"Promote {LEAGUE}@1").click()
     dialog = page.get_by_role("dialog", name=f"Promote {LEAGUE}@1")
     served.registry.aliases.set(LEAGUE, "champion", 2, expected=3, actor="cli", reason="faster")
@@ -194,6 +195,7 @@ def test_a_completed_evaluation_shows_its_leaderboard(tab: Tab, served: Served) 
     page = tab.open(f"{L}/evaluations/new")
     page.get_by_role("button", name=re.compile("^API key")).click()
     enter_key(page, served.keys["everything"])
+    expect(page.get_by_role("dialog")).to_have_count(0)  # the page is loaded anew
     page.get_by_label("script:random").check()
     page.get_by_label("@2", exact=True).check()
     page.get_by_label("Blocks per pair").fill("3")
@@ -210,6 +212,7 @@ def test_an_invalid_evaluation_shows_an_error(tab: Tab, served: Served) -> None:
     page = tab.open(f"/leagues/{EMPTY}/evaluations/new")
     page.get_by_role("button", name=re.compile("^API key")).click()
     enter_key(page, served.keys["everything"])
+    expect(page.get_by_role("dialog")).to_have_count(0)  # the page is loaded anew
     expect(page.get_by_label("script:random")).to_be_visible()
     expect(page.get_by_label("script:one_ply")).to_have_count(0)  # it does not know this game
     page.get_by_label("Seed").fill(str(2**63))

@@ -116,6 +116,7 @@ def test_the_address_and_the_history_of_the_browser_select_pages(opened: Open, r
     page = select(opened(report), "Verdicts")
     page.get_by_role("row", name=re.compile("@3 @2")).get_by_role("link").click()
     expect(page.get_by_text("Stronger: ")).to_be_visible()
+    expect(page).to_have_url(re.compile(r"/verdicts/[^/]+$"))
     address = page.url
     page.go_back()
     expect(page.get_by_role("heading", level=2)).to_have_text("Verdicts")
@@ -138,7 +139,7 @@ def test_an_upset_is_shown_step_by_step(opened: Open, report: dict[str, Any]) ->
         expect(image).to_have_attribute("src", step["picture"])
         (move,) = step["moves"]
         expect(page.locator(".moves")).to_contain_text(re.compile(rf"{move['agent']}.*plays\s*{move['action']}"))
-    assert page.url.endswith(f"#{recording['length']}")
+    expect(page).to_have_url(re.compile(rf"#{recording['length']}$"))
     page.reload()
     expect(page.get_by_text(f"{recording['length']} of {recording['length']}")).to_be_visible()
 

@@ -2,6 +2,7 @@
 
 import secrets
 from collections.abc import Iterator
+from pathlib import Path
 
 import grpc
 import httpx
@@ -19,14 +20,14 @@ NAME = 4_000_000
 SERVICE = "/inference.GRPCInferenceService/ModelReady"
 
 
-def unauthenticated(url: str, grpc_address: str, calls: int) -> Iterator[Target]:
-    """The growth of the replica that grew most."""
+def unauthenticated(url: str, grpc_address: str, calls: int, home: Path) -> Iterator[Target]:
+    """The growth of the replica that grew most. home: LEAGUE_HOME of the server."""
     with httpx.Client(base_url=url, timeout=30) as client:
         _call_http(client, 4)
         _call_grpc(grpc_address, 4)
-        before = {replica.pid: replica.memory_info().rss for replica in replica_processes()}
+        before = {replica.pid: replica.memory_info().rss for replica in replica_processes(home)}
         refused = _call_http(client, calls // 2) + _call_grpc(grpc_address, calls - calls // 2)
-    growth = max(replica.memory_info().rss - before[replica.pid] for replica in replica_processes()) / 2**20
+    growth = max(replica.memory_info().rss - before[replica.pid] for replica in replica_processes(home)) / 2**20
     yield Target("calls without a key: growth of a replica", round(growth, 1), "MB", at_most=GROWTH)
     yield Target("calls without a key that were not refused", calls - refused, at_most=0, note=f"of {calls:,}")
 
