@@ -50,7 +50,7 @@ FROM wheel AS trainer-packages
 RUN apt-get update && apt-get install --yes --no-install-recommends build-essential swig && rm -rf /var/lib/apt/lists/*
 RUN python -m venv /opt/league \
     && wheel=$(echo /dist/*.whl) \
-    && /opt/league/bin/pip install --no-cache-dir --constraint constraints.txt "${wheel}[environments,object-store,openspiel,postgres]"
+    && /opt/league/bin/pip install --no-cache-dir --constraint constraints.txt "${wheel}[environments,object-store,openspiel,optuna,postgres]"
 
 FROM runtime AS trainer
 COPY --from=trainer-packages /opt/league /opt/league

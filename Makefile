@@ -5,7 +5,7 @@ INSTALLED := .venv/.installed
 
 PROCESSES ?= 3
 
-.PHONY: setup demo test test-slow coverage check fix bench dist docs generate protocol clean
+.PHONY: setup demo test test-slow test-clients coverage check fix bench dist docs generate protocol clean
 .DEFAULT_GOAL := setup
 
 # LOCKED=1 installs the files of requirements/ and no others: Linux on x86-64 only.
@@ -43,15 +43,19 @@ coverage: setup
 	$(MAKE) test PYTEST="--cov --cov-report= $(PYTEST)"
 	$(BIN)/coverage report --skip-covered --sort=cover
 
-# Learning to a level, every environment, kills and clusters. The machines of a cluster share the cores: its tests run
-# alone.
+# Learning to a level, every environment, kills and clusters. A cluster that serves under load needs all cores: its tests
+# run alone.
 test-slow: setup
 ifdef TESTS
 	$(BIN)/python -m pytest -m slow -n $(PROCESSES) --dist loadscope $(PYTEST) $(TESTS)
 else
-	$(BIN)/python -m pytest -m slow -n $(PROCESSES) --dist loadscope $(PYTEST) --ignore tests/cluster
-	$(BIN)/python -m pytest -m slow $(PYTEST) tests/cluster
+	$(BIN)/python -m pytest -m slow -n $(PROCESSES) --dist loadscope $(PYTEST) --ignore tests/cluster/test_cluster.py --ignore tests/clients
+	$(BIN)/python -m pytest -m slow $(PYTEST) tests/cluster/test_cluster.py
 endif
+
+# Clients in other languages, with their own package managers: `npm ci` needs npm's registry.
+test-clients: setup
+	$(BIN)/python -m pytest -m slow $(PYTEST) tests/clients
 
 check: setup
 	$(BIN)/ruff format --check .
@@ -82,6 +86,7 @@ docs: setup
 generate: setup protocol
 	$(BIN)/python scripts/generate_sync_client.py
 	$(BIN)/python scripts/benchmark_page.py
+	PYTHONPATH=. $(BIN)/python scripts/generate_typescript.py
 
 # The messages of gRPC, in a descriptor pool of their own: a process may hold others of the same names (tritonclient's).
 PROTOCOL := serve_app/inference_protocol

@@ -1,9 +1,12 @@
-"""Do replicas follow the load? One replica gets a load, four times as much, and then the first again.
+"""Do replicas follow the load?
+
+One replica gets a load, four times as much, and then the first again.
 
 Printed: the time from the step up to the first answer of a second replica, the time from the step down until one is
 gone, and the calls that were lost. Settings are those of deploy.yaml, except for a shorter `downscale_delay_s`. The
 cost of a request is measured first; the first load needs a third of the target of one replica, and four times as much
-exceeds it.
+exceeds it. Where it does not, since requests that wait together cost less than single ones, the load grows further, and
+the time counts from the last step.
 """
 
 import time
@@ -29,13 +32,15 @@ TARGET = 0.6
 DOWNSCALE_DELAY = 10.0
 HIDDEN = (2048, 2048)
 """Units of the network. Inference dominates the cost of a request, which hence does not depend on the rate."""
-SAMPLE = 30.0
-"""The difference between the rates, in requests per second, with which the cost of a request is measured."""
+LEAST = 4.0
+"""The least of the rates, in requests per second, with which the cost of a request is measured."""
 STEADY = 15.0
 """Seconds with a constant load."""
 SHORTEST = 8.0
 """Seconds in which the cost of a request is measured, at least."""
-DEADLINE = 120.0
+PATIENCE, GROWTH = 30.0, 1.5
+"""Seconds after which a load that started no second replica grows by this factor."""
+DEADLINE = 240.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +48,7 @@ class Following:
     """How replicas followed the load.
 
     Attributes:
-        rate: First load in requests per second.
+        rates: First load and the load that needed a second replica, in requests per second.
         cost: Processor time of a request in seconds.
         started: Seconds from the step up until Ray had started the second replica, which then loads the program.
         appeared: Seconds from the step up to the first answer of the second replica.
@@ -51,7 +56,7 @@ class Following:
         record: What callers saw.
     """
 
-    rate: float
+    rates: tuple[float, float]
     cost: float
     started: float
     appeared: float
@@ -62,8 +67,8 @@ class Following:
 def main(quick: Quick = False) -> Iterator[Target]:
     """Step the load up and down."""
     following = follow(5.0 if quick else STEADY)
-    record, rate = following.record, following.rate
-    note = f"{rate:,.0f} to {FACTOR * rate:,.0f} requests/s; Ray started it after {following.started:.1f} s"
+    record, (low, high) = following.record, following.rates
+    note = f"{low:,.0f} to {high:,.0f} requests/s; Ray started it after {following.started:.1f} s"
     yield Target("step up: second replica answers", round(following.appeared, 1), "s", at_most=APPEARED, note=note)
     yield Target("step down: second replica gone", round(following.removed, 1), "s")
     note = f"of {record.calls:,}, longest {record.longest:.2f} s {'; '.join(record.lost)}".strip()
@@ -83,13 +88,11 @@ def follow(steady: float, target: float = TARGET, first: float = FIRST, factor: 
     change = partial(_change, target=target)
     with served(hidden=HIDDEN, change=change, replicas=1, max_replicas=2) as (url, registry):
         with beside(step, url) as load:
-            cost = _cost(registry, load, max(steady, SHORTEST))
+            cost = _cost(registry, load, max(steady, SHORTEST), target)
             rate = first * target / cost
             load.send(rate)
             _hold(registry, 1, steady)
-            up = time.monotonic()
-            load.send(factor * rate)
-            until(lambda: len(replica_processes(registry.storage.home)) == 2, DEADLINE)
+            up, high = _step_up(registry, load, factor * rate)
             started = time.monotonic() - up
             until(lambda: _replicas(registry) == 2, DEADLINE)
             _hold(registry, 2, steady)
@@ -100,7 +103,7 @@ def follow(steady: float, target: float = TARGET, first: float = FIRST, factor: 
             _hold(registry, 1, steady)
         appeared, *later = load.result.since(up)
         assert not later, "a second replica was added, removed, and added again"
-    return Following(rate, cost, started, appeared, removed, load.result)
+    return Following((rate, high), cost, started, appeared, removed, load.result)
 
 
 def _change(document: dict[str, Any], target: float) -> None:
@@ -109,14 +112,34 @@ def _change(document: dict[str, Any], target: float) -> None:
     autoscaling["policy"]["policy_kwargs"]["target"] = target
 
 
-def _cost(registry: Registry, load: Performance[Steps], seconds: float) -> float:
-    """Processor time of a request in seconds."""
+def _cost(registry: Registry, load: Performance[Steps], seconds: float, target: float) -> float:
+    """Processor time of a request in seconds, from a load that no machine needs a second replica for."""
     (replica,) = replica_processes(registry.storage.home)
-    load.send(SAMPLE)
+    rate = LEAST
+    load.send(rate)
     _busy(replica.cpu_times, seconds / 2)  # after the start, the program still loads what it rarely needs
-    once = _busy(replica.cpu_times, seconds)
-    load.send(2 * SAMPLE)
-    return (_busy(replica.cpu_times, seconds) - once) / SAMPLE
+    least = busy = _busy(replica.cpu_times, seconds)
+    while busy - least < target / 4:
+        rate *= 2
+        load.send(rate)
+        busy = _busy(replica.cpu_times, seconds)
+    return (busy - least) / (rate - LEAST)
+
+
+def _step_up(registry: Registry, load: Performance[Steps], rate: float) -> tuple[float, float]:
+    """Raise the load until Ray has started a second replica. Returns the time of the last step, and its rate."""
+    deadline = time.monotonic() + DEADLINE
+    while True:
+        up = time.monotonic()
+        load.send(rate)
+        try:
+            until(lambda: len(replica_processes(registry.storage.home)) == 2, PATIENCE)
+        except TimeoutError:
+            if up > deadline:
+                raise
+            rate *= GROWTH
+        else:
+            return up, rate
 
 
 def _busy(times: Callable[[], object], seconds: float) -> float:

@@ -1,5 +1,6 @@
-"""Do verdicts have their nominal error rates? Simulations of gates, years, anchors and intervals, and gates with real
-games.
+"""Do verdicts have their nominal error rates?
+
+Simulations of gates, years, anchors and intervals, and gates with real games.
 
 Each part prints measured values beside their targets. All parts are seeded, so that the numbers are reproducible on any
 machine.

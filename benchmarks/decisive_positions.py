@@ -1,4 +1,6 @@
-"""Does a version of connect four keep the outcome that perfect play reaches? Late positions, solved exactly.
+"""Does a version of connect four keep the outcome that perfect play reaches?
+
+Late positions, solved exactly.
 
 The positions come from games that `script:one_ply` plays against itself: at most one of each game, with 24 pieces or
 more, in which some legal moves reach the best outcome and others do not. They are the same in each run. The bound is

@@ -1,4 +1,6 @@
-"""How fast are matches played, and do more workers help? Connect four, on one core unless workers are compared.
+"""How fast are matches played, and do more workers help?
+
+Connect four, on one core unless workers are compared.
 
 Parts: throughput (in CPU time, from the schedule to the Match records, with ONNX policies on both sides: MLPs of 2×256
 and the convolutional networks of the bundled connect_four; compared with the unmodified `env()` with random legal

@@ -1,4 +1,7 @@
-"""What does a version cost a replica: time to load, memory, and is memory constant over many swaps?
+"""What do an idle server and a version cost, and is memory constant over many swaps?
+
+A server with two replicas is idle: the memory of all its processes (PSS, which counts shared pages once) and their
+processor time.
 
 One replica behind HAProxy. A version with a network of 1 MB is requested by number for the first time, and again: the
 difference is the time for finding it in the registry, verifying, loading and warming up. A killed replica restarts:
@@ -28,6 +31,8 @@ TO_START = 3.0
 """Seconds."""
 POLICIES, MORE = 100, 150.0
 """Maximum additional memory of this number of policies, in MB."""
+IDLE = {"memory": 850, "processes": 12, "processor time": 60}
+"""At most: in MB, number, and in milliseconds per second."""
 SWAPS, GROWTH = 10_000, 2.0
 """Number, and percent."""
 WARM = 0.1
@@ -35,11 +40,34 @@ WARM = 0.1
 
 
 def main(quick: Quick = False, swaps: int = SWAPS) -> Iterator[Target]:
-    """Measure time to load, time to start, and memory."""
+    """Measure an idle server, time to load, time to start, and memory."""
+    yield from _idling(5 if quick else 60)
     yield _loading(3 if quick else 20)
     yield _starting(1 if quick else 5)
     yield _holding(10 if quick else POLICIES)
     yield _swapping(100 if quick else swaps)
+
+
+def _idling(seconds: int) -> Iterator[Target]:
+    with served(replicas=2):
+        time.sleep(seconds)  # what the start has left to do
+        before = _processor_times()
+        time.sleep(seconds)
+        after = _processor_times()
+        memory = sum(process.memory_full_info().pss for process in after)
+    spent = sum(after[process] - before[process] for process in before.keys() & after.keys())
+    for name, value, unit in (
+        ("memory", round(memory / 1e6), "MB"),
+        ("processes", len(after), ""),
+        ("processor time", round(1e3 * spent / seconds, 1), "ms/s"),
+    ):
+        yield Target(f"{name} of an idle server", value, unit, at_most=IDLE[name])
+
+
+def _processor_times() -> dict[psutil.Process, float]:
+    """The seconds of processor time of each process of the server."""
+    times = {process: process.cpu_times() for process in psutil.Process().children(recursive=True)}
+    return {process: spent.user + spent.system for process, spent in times.items()}
 
 
 def _loading(times: int) -> Target:

@@ -8,7 +8,7 @@ reported.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from statistics import median
 
@@ -22,6 +22,7 @@ from benchmarks.harness import CONFIGS, Quick, Target
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES, published
 from benchmarks.load import http as load
 from benchmarks.load import websocket as stream_load
+from benchmarks.load.http import binary
 from benchmarks.parity import prepare, situations
 from benchmarks.training.learned import local_ray
 from league.policies import load as load_policy
@@ -42,7 +43,6 @@ ACTIONS = 150_000
 """Actions per second, in batches of 256."""
 BESIDE_INFERENCE = 1.3
 """Ratio to the time of inference alone, for an image in binary."""
-BINARY = {"Content-Type": "application/octet-stream"}
 STREAM = "stream, binary"
 MNIH: dict[str, object] = {
     "convolutions": (
@@ -53,7 +53,6 @@ MNIH: dict[str, object] = {
     "hidden": (512,),
 }
 """V. Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015)."""
-DATATYPES = {"int8": "INT8", "uint8": "UINT8"}
 
 
 def main(quick: Quick = False, rounds: int = 5, seconds: float = 4.0) -> Iterator[Target]:
@@ -207,23 +206,6 @@ def _image(registry: Registry, version: VersionRow) -> NDArray:
     )
     (batches,) = situations(row.config, row.interface, modules, 64).values()
     return np.ascontiguousarray(batches[-1].observations["observation"][-1])
-
-
-def binary(arrays: Mapping[str, NDArray], outputs: Sequence[str] = ("action",)) -> tuple[bytes, dict[str, str]]:
-    """A request with the binary tensor extension: its body and its headers."""
-    inputs = [
-        {
-            "name": name,
-            "shape": list(array.shape),
-            "datatype": DATATYPES[array.dtype.name],
-            "parameters": {"binary_data_size": array.nbytes},
-        }
-        for name, array in arrays.items()
-    ]
-    wanted_outputs = [{"name": name, "parameters": {"binary_data": True}} for name in outputs]
-    head = orjson.dumps({"inputs": inputs, "outputs": wanted_outputs})
-    body = head + b"".join(array.tobytes() for array in arrays.values())
-    return body, BINARY | {"Inference-Header-Content-Length": str(len(head))}
 
 
 def _document(observation: object) -> bytes:

@@ -7,9 +7,11 @@ answers at the end, and its memory has grown by at most 5 % since the first tent
 from collections.abc import Iterator
 
 from benchmarks.harness import Quick, Target
+from benchmarks.leagues.served_league import served
 from tests.support.attacks.invalid_requests import invalid_requests
 
 
 def main(quick: Quick = False, bodies: int = 10_000, seed: int = 0) -> Iterator[Target]:
     """Send all bodies to one replica."""
-    yield from invalid_requests(500 if quick else bodies, seed)
+    with served(2, replicas=1) as (url, registry):
+        yield from invalid_requests(url, registry.storage.home, 500 if quick else bodies, seed)

@@ -6,8 +6,9 @@ import re
 import statistics
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -34,7 +35,8 @@ class Target:
     """A measured value, and what it should be.
 
     value: one number, or several of the same kind, such as one for each seed. at_least, at_most: limits of each number;
-    None: the value is only reported. peer: what it was compared with in the same run.
+    None: the value is only reported. peer: what it was compared with in the same run. machine: where it was measured;
+    empty for the machine that records it.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Target:
     at_most: float | None = None
     peer: str = ""
     note: str = ""
+    machine: str = ""
 
     @property
     def met(self) -> bool:
@@ -121,9 +124,11 @@ def _target(document: dict[str, object]) -> Target:
 
 
 def record(benchmark: str, options: str, targets: Iterable[Target]) -> None:
-    """Add a run of today on this machine to the results of a benchmark."""
-    run = Run(datetime.now(UTC).date().isoformat(), machine(), options, tuple(targets))
-    write(benchmark, [*recorded(benchmark), run])
+    """Add a run of today to the results of a benchmark, or one for each machine of the targets."""
+    today, runs = datetime.now(UTC).date().isoformat(), recorded(benchmark)
+    for place, group in groupby(targets, key=lambda target: target.machine):
+        runs.append(Run(today, place or machine(), options, tuple(replace(target, machine="") for target in group)))
+    write(benchmark, runs)
 
 
 def write(benchmark: str, runs: Iterable[Run]) -> None:

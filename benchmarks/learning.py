@@ -1,4 +1,6 @@
-"""Do the shipped configurations learn? Each part trains one for a fixed time and measures the result.
+"""Do the shipped configurations learn?
+
+Each part trains one for a fixed time and measures the result.
 
 Parts: rps, cars_and_lights, shared_encoder, simple_spread, simple_spread_large_minibatches, pistonball;
 leduc_vs_random, leduc_holdem_dqn, connect_four_dqn by DQN; two_step_game, simple_spread_qmix. With several seeds or
@@ -18,12 +20,12 @@ from scipy import stats
 from benchmarks.harness import CONFIGS, Parts, Quick, Target, chosen
 from benchmarks.training.learned import (
     LearningCurve,
+    in_processes,
     interval,
     learn,
     local_ray,
     one_thread,
     print_progress,
-    two_at_once,
 )
 from benchmarks.training.pistonball import pistonball
 from benchmarks.training.two_step import two_step_game
@@ -78,7 +80,7 @@ def rps(scale: float) -> Iterator[Target]:
     rounds = 15.0
     best = {"script:first": rounds, "script:mirror": rounds, "script:random": 0.0}
     jobs = [LearningJob("rps", {"opponents": [ref]}, 30 * scale) for ref in best]
-    for (ref, value), curve in zip(best.items(), two_at_once(work, jobs), strict=True):
+    for (ref, value), curve in zip(best.items(), in_processes(work, jobs), strict=True):
         low, high = interval(curve.greedy)
         # The interval of a best response contains its value.
         shortfall = max(0.0, value - high)
@@ -92,7 +94,7 @@ def cars_and_lights(scale: float) -> Iterator[Target]:
     jobs = [LearningJob("cars_and_lights", {"seed": seed}, 120 * scale) for seed in range(3)]
     shares = [
         100 * (curve.greedy.mean() - curve.random.mean()) / (best - curve.random.mean())
-        for curve in two_at_once(work, jobs)
+        for curve in in_processes(work, jobs)
     ]
     yield Target("cars_and_lights, share of the optimum", _rounded(shares, 1), "%", at_least=NEAR_OPTIMUM)
 
@@ -104,7 +106,7 @@ def shared_encoder(scale: float) -> Iterator[Target]:
         for shared in (True, False)
         for seed in SEEDS
     ]
-    curves = list(two_at_once(work, jobs))
+    curves = list(in_processes(work, jobs))
     shared, separate = (np.array([curve.greedy.mean() for curve in part]) for part in (curves[:5], curves[5:]))
     low, _ = stats.t.interval(0.95, len(SEEDS) - 1, separate.mean(), stats.sem(separate))
     note = f"{curves[0].parameters:,} and {curves[5].parameters:,} parameters; separate {separate.mean():.2f}"
@@ -146,7 +148,7 @@ def _better_than_random(
 ) -> Iterator[Target]:
     steps = SPREAD_STEPS * scale
     jobs = [LearningJob(config, {**(settings or {}), "seed": s}, math.inf, steps, ablated) for s in seeds]
-    curves = list(two_at_once(work, jobs))
+    curves = list(in_processes(work, jobs))
     better = [curve.greedy.mean() - curve.random.mean() for curve in curves]
     for seed, curve in zip(seeds, curves, strict=True):
         print_progress(f"{name}, seed {seed}", curve.curve)

@@ -21,7 +21,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_ME
 from scipy import stats
 
 from benchmarks.harness import CONFIGS, Quick, Target
-from benchmarks.training.learned import local_ray, one_thread, two_at_once
+from benchmarks.training.learned import in_processes, local_ray, one_thread
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.algorithms.maddpg import MADDPG
@@ -134,7 +134,7 @@ def main(
         for name, critic in CRITICS.items()
     }
     # Seeds of both algorithms run side by side, so that both have the same share of the machine.
-    list(two_at_once(train, [job for pair in zip(*jobs.values(), strict=True) for job in pair]))
+    list(in_processes(train, [job for pair in zip(*jobs.values(), strict=True) for job in pair]))
     trained = {name: [Trained.load(job.file) for job in of_algorithm] for name, of_algorithm in jobs.items()}
     for name, versions in trained.items():
         for seed, version in enumerate(versions):

@@ -188,7 +188,8 @@ def _tests(module: str, clone: Path, whole: bool) -> Iterator[list[str]]:
 
 def _first_failure(tests: list[str], clone: Path) -> str | None:
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "--timeout", "300", *tests]
-    environment = os.environ | {"PYTHONPATH": str(clone), "PYTHONDONTWRITEBYTECODE": "1"}
+    path = os.pathsep.join(map(str, (clone, clone / "clients/python")))
+    environment = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
     run = subprocess.run(command, cwd=clone, env=environment, capture_output=True, text=True, check=False)
     if run.returncode in (0, 5):  # 5: no test was selected
         return None

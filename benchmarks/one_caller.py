@@ -1,5 +1,6 @@
-"""What can one caller do to the others? Memory that a caller without a key can hold in a replica, and how long a caller
-can stall a probe.
+"""What can one caller do to the others?
+
+Memory that a caller without a key can hold in a replica, and how long a caller can stall a probe.
 
 grpc_messages     messages of gRPC with millions of elements
 websocket_pings   streams that send pings, pongs and fragments; without a key, to a server that requires none

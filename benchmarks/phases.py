@@ -1,4 +1,6 @@
-"""What does learning cost in addition to sampling, for algorithms with a replay buffer? One process, one core.
+"""What does learning cost in addition to sampling, for algorithms with a replay buffer?
+
+One process, one core.
 
 For each configuration: environment steps per second with learning, divided by phase; and of sampling alone, including
 networks, exploration and transitions for the buffer, compared with the unmodified environment with random legal actions
@@ -77,7 +79,7 @@ def learning(algorithm: OffPolicy, part: Phase, seconds: float) -> tuple[float, 
     phases, first, began = dict.fromkeys(PHASES, 0.0), algorithm.steps, time.perf_counter()
     while (elapsed := time.perf_counter() - began) < seconds:
         times = totals(algorithm.train())
-        phases = {phase: value + times[phase] for phase, value in phases.items()}
+        phases = {phase: value + times.get(phase, 0.0) for phase, value in phases.items()}
     shares = {phase.removeprefix("time/"): value / elapsed for phase, value in phases.items()}
     return (algorithm.steps - first) / part.agents / elapsed, shares | {"other": 1 - sum(shares.values())}
 

@@ -98,9 +98,10 @@ def rate(seconds):
     return repeat(play, seconds)
 """
 TRAINING = """
+from pathlib import Path
+
 import torch
 from benchmarks import sampling
-from benchmarks.harness import CONFIGS
 from benchmarks.training.learned import local_ray
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -109,7 +110,9 @@ from training.runs.trial import build_algorithm
 if {mlp}:
     league = sampling.league(sampling.FOUR, num_envs="auto", **{settings})
 else:
-    league = LeagueConfig.load(CONFIGS / "connect_four.yaml").with_training(runners=0, **{settings})
+    places = Path("policy_league/configs/connect_four.yaml"), Path("configs/connect_four.yaml")  # now and before 0.1.0
+    shipped = next(place for place in places if place.exists())
+    league = LeagueConfig.load(shipped).with_training(runners=0, **{settings})
 ray = local_ray(cpus=1)
 ray.__enter__()
 torch.set_num_threads(1)

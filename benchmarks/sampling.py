@@ -1,5 +1,6 @@
-"""How fast does training sample, compared with RLlib's runner and with the unmodified environment? One torch thread per
-runner.
+"""How fast does training sample, compared with RLlib's runner and with the unmodified environment?
+
+One torch thread per runner.
 
 Parts: simple_spread and connect_four (one runner compared with RLlib's MultiAgentEnvRunner with its PettingZoo
 wrappers, for several numbers of environments), stock (one runner, including its network, compared with the unmodified
@@ -35,7 +36,8 @@ from benchmarks.stock import play_game
 from benchmarks.training.learned import local_ray
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from training.algorithms.ppo import PPO, algorithm_config
+from training.algorithms.ppo import PPO
+from training.algorithms.rllib_config import algorithm_config
 from training.modules.actor_critic import ActorCritic
 from training.runs.trial import build_algorithm
 from training.sampling.env_runner import BatchedEnvRunner
@@ -152,7 +154,7 @@ def iteration(quick: bool) -> Iterator[Target]:
 def runners(quick: bool) -> Iterator[Target]:
     """Two runners sample at least 1.7 times as fast as one."""
     algorithms = {
-        count: build_algorithm(league(SPREAD, runners=count, train_batch_size=9600), interface(league(SPREAD)))
+        count: build_algorithm(league(SPREAD, runners=count, train_batch_size=9600, lag=0), interface(league(SPREAD)))
         for count in (1, 2)
     }
     rates = in_rounds(

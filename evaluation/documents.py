@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
+from functools import cache
 from typing import Any, Literal
 
 from league.conditions import ActionSelection
@@ -17,16 +18,25 @@ class Document:
 
     def to_json(self) -> dict[str, Any]:
         """Nested dictionaries and lists. Non-finite numbers become None."""
-        document: dict[str, Any] = _plain(asdict(self))  # type: ignore[call-overload]
+        document: dict[str, Any] = _plain(self)
         return document
 
 
+@cache
+def _names(record: type) -> tuple[str, ...]:
+    return tuple([field.name for field in fields(record)])
+
+
 def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    if is_dataclass(value) and not isinstance(value, type):
+        return {name: _plain(getattr(value, name)) for name in _names(type(value))}
+    return value
 
 
 def iso_timestamp(moment: datetime) -> str:
@@ -76,6 +86,13 @@ class Difference(Document):
     low: float | None
     high: float | None
 
+    @property
+    def opposite(self) -> Difference:
+        """That of the second's returns minus the first's."""
+        return Difference(
+            -self.mean, None if self.high is None else -self.high, None if self.low is None else -self.low
+        )
+
     def __str__(self) -> str:
         """`+1.5 [0.9, 2.1]`"""
         span = "" if self.low is None or self.high is None else f" [{self.low:.4g}, {self.high:.4g}]"
@@ -112,8 +129,9 @@ class Exploitability(Document):
 
 @dataclass(frozen=True, slots=True)
 class Payoff(Document):
-    """Payoff matrix. score[i][j]: mean score of i against j over games[i][j] games; None if they did not meet.
+    """Payoff matrix.
 
+    score[i][j]: mean score of i against j over `games[i][j]` games; None if they did not meet.
     by_side[side][i][j]: the same for games in which i played that side alone.
     difference[i][j]: mean return of i minus that of j in the games of the same blocks.
     """
@@ -136,7 +154,7 @@ class Estimate(Document):
 
 @dataclass(frozen=True, slots=True)
 class Population(Document):
-    """Shares of the contestants, computed from the whole payoff matrix; they sum to 1.
+    """Shares of the contestants, in the order of the payoff matrix and computed from all of it; they sum to 1.
 
     alpha_rank: share of time in an imitating population. nash: probability in the maximum-entropy equilibrium.
     """
@@ -163,8 +181,8 @@ class CrossPlay(Document):
 class Forfeits(Document):
     """The games that a contestant forfeited.
 
-    reasons: reason → number of games. details: reason → the detail of the first forfeit, see
-    league.results.records.Forfeit; without reasons of which none was recorded.
+    reasons: reason → number of games. details: reason → the exception with its place, or the action, of the first
+    forfeit; without reasons of which none was recorded.
     """
 
     games: int

@@ -2,7 +2,7 @@
 
 import sysconfig
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,17 @@ OWN_PACKAGES = {
 
 
 def raised_at(error: BaseException) -> str | None:
-    """Return where the user's code raised an error, as `FILE, line N`: the last line outside of the Python installation
-    and of this project."""
-    frames = traceback.extract_tb(error.__traceback__)
-    outside = [frame for frame in frames if not frame.filename.startswith((*_INSTALLED, "<", *OWN_PACKAGES.values()))]
-    return f"{outside[-1].filename}, line {outside[-1].lineno}" if outside else None
+    """Return where the user's code raised an error, as `FILE, line N`."""
+    return last_of_user((frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__))
+
+
+def last_of_user(lines: Iterable[tuple[str, int | str | None]]) -> str | None:
+    """Return the last line outside of the Python installation and of this project, as `FILE, line N`.
+
+    lines: files and numbers of lines.
+    """
+    outside = [line for line in lines if not line[0].startswith((*_INSTALLED, "<", *OWN_PACKAGES.values()))]
+    return "{}, line {}".format(*outside[-1]) if outside else None
 
 
 def cause(error: BaseException) -> str:

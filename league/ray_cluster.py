@@ -11,13 +11,20 @@ import threading
 import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from league.errors import ConfigError, NotReady, one_line
-from league.local_ray.loopback_node import LIMITS, StartFailed, loopback_addresses, loopback_node
+from league.local_ray.loopback_node import (
+    LIMITS,
+    WAITING_WORKERS,
+    WITHOUT_AGENTS,
+    StartFailed,
+    loopback_addresses,
+    loopback_node,
+)
 from league.local_ray.token import create_token, forget_token
 from league.settings import Storage
 from league.stack import difference, installed_with_this
@@ -47,11 +54,15 @@ class LocalRay:
         cpus: Number of CPUs.
         object_store: Shared memory in MB, at least MIN_OBJECT_STORE.
         dashboard: Whether to start Ray's dashboard.
+        runtime_envs: Whether tasks may have runtime environments, for which an agent starts.
+        preload: A module that workers import before they have a task. One worker per CPU starts with the node.
     """
 
     cpus: int | None = None
     object_store: int | None = None
     dashboard: bool = False
+    runtime_envs: bool = False
+    preload: str | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         if self.object_store is not None and self.object_store < MIN_OBJECT_STORE:
@@ -62,6 +73,8 @@ UNLIMITED = LocalRay()
 OF_DASHBOARD = ("aiohttp", "aiohttp_cors", "opencensus", "prometheus_client")
 """Packages of the extra `ray[default]` without which Ray starts no dashboard."""
 
+PRELOAD = "RAY_preload_python_modules"
+"""Ray's environment variable."""
 SPIN_COUNT = "3000"
 """How often a thread of torch looks for work before it sleeps. With the default of GNU OpenMP, 300,000, threads that
 wait take the cores from those that work: if other programs use the cores too, an update took eleven times as long as
@@ -92,12 +105,10 @@ def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
     if local.dashboard and (missing := [name for name in OF_DASHBOARD if find_spec(name) is None]):
         raise ConfigError(f"--dashboard needs {missing[0]}: pip install 'ray[default]=={ray.__version__}'")
     os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)  # inherited by all processes of Ray
-    for name, limit in LIMITS.items():
-        os.environ.setdefault(name, limit)
     create_token()
     for attempt in range(ATTEMPTS):
         try:
-            with loopback_node():
+            with _node_variables(local), loopback_node(local.runtime_envs or local.dashboard):
                 dashboard = _connect(
                     address="local",
                     num_cpus=local.cpus,
@@ -112,6 +123,24 @@ def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
         except Exception as error:
             raise NotReady(f"Ray did not start: {one_line(error)}") from error
     return dashboard
+
+
+@contextmanager
+def _node_variables(local: LocalRay) -> Iterator[None]:
+    """Set the environment variables of a node that is started here, unless the user has set them.
+
+    Subprocesses do not inherit them: they may start another node.
+    """
+    variables = LIMITS if local.dashboard else LIMITS | WITHOUT_AGENTS
+    if local.preload is not None:
+        variables = variables | {PRELOAD: local.preload} | WAITING_WORKERS
+    variables = {name: value for name, value in variables.items() if name not in os.environ}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name in variables:
+            del os.environ[name]
 
 
 def join(address: str, **options: Any) -> str | None:

@@ -107,6 +107,8 @@ MOST_CHANCES = 32
 """Actions per move with probabilities."""
 MOST_CHOICES = 10_000
 """Actions of a person in one game."""
+MOST_ANALYSED = 1000
+"""Simulations of a search version that evaluates each position of a game."""
 
 
 class RecordingRequest(_Request):
@@ -121,6 +123,8 @@ class RecordingRequest(_Request):
     first: int = Field(default=0, ge=0, le=MOST_NUMBER)
     end: int | None = Field(default=None, ge=0, le=MOST_NUMBER)
     every: int = Field(default=1, ge=1, le=MOST_NUMBER)
+    analysis: int | None = Field(default=None, ge=1, le=MOST_NUMBER)
+    """A search version that evaluates the positions, in place of the players."""
 
     def includes(self, step: int, is_last: bool) -> bool:
         """Whether the response contains a step."""
@@ -159,6 +163,13 @@ class PlayBody(_Request):
     chances: bool = Field(
         default=False,
         description="Return the probabilities of the opponent's actions, and those of the opponent in your position.",
+    )
+    analysis: int | None = Field(
+        default=None,
+        ge=1,
+        le=MOST_NUMBER,
+        description="A search version that evaluates your positions: `chances` are its probabilities there, and `value`"
+        " is the return that it expects.",
     )
 
 
@@ -208,6 +219,7 @@ class RecordedMove(FrozenModel):
     ref: str = Field(description="The player: a version, a script, or `person`.")
     action: bool | int | float | list[Any] = Field(description="A number, or nested lists of numbers.")
     chances: Chances
+    value: float | None = Field(description="The return that the agent expects; null unless a search version says.")
 
 
 class RecordedStep(FrozenModel):
@@ -305,6 +317,7 @@ class PlayedGame(FrozenModel):
         " a game."
     )
     chances: Chances
+    value: float | None = Field(description="The return that you can expect; null unless a search version says.")
     forfeits: tuple[GameForfeit, ...]
 
 

@@ -1,19 +1,20 @@
 """MkDocs hooks: pages link to files of the repository, and the site contains what they link to.
 
-CONTRIBUTING.md and CHANGELOG.md become pages. The page Modules is made from docstrings, and the page HTTP reference
-from the declared routes. Every other file outside of `docs/` that a page links to becomes a page with its source. A
-link to a file that does not exist stays as it is, so that the strict build fails.
+CONTRIBUTING.md and CHANGELOG.md become pages. The page Modules is made from docstrings, the page HTTP reference from
+the declared routes, and the page JSON documents from the records of evaluations. Every other file outside of `docs/`
+that a page links to becomes a page with its source. A link to a file that does not exist stays as it is, so that the
+strict build fails.
 """
 
 import posixpath
 import re
 from pathlib import Path
 
-from http_reference import page as http_reference
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 from module_index import page as module_index
+from references import documents_page, http_page
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -28,7 +29,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name in PAGES:
         linked |= set(_links((ROOT / name).read_text(), ROOT / name))
     files.append(File.generated(config, "modules.md", content=module_index()))
-    files.append(File.generated(config, "http-reference.md", content=http_reference()))
+    files.append(File.generated(config, "http-reference.md", content=http_page()))
+    files.append(File.generated(config, "json-documents.md", content=documents_page()))
     for name, uri in PAGES.items():
         files.append(File.generated(config, uri, content=(ROOT / name).read_text()))
     for path in sorted(path for path in linked if not path.is_relative_to(DOCS) and path.exists()):

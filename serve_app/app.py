@@ -1,7 +1,8 @@
 """Composes a replica, and builds the Ray Serve application that deploy.yaml names.
 
     HAProxy → replica: uvicorn → the Starlette application below
-                                   └ requests that need an environment → the evaluation service, by handle
+                                   ├ requests that need an environment → the evaluation service, by handle
+                                   └ requests for search versions → the search service, by handle
 
 A request is answered in the process that it reaches first, and bypasses Ray Serve's request path
 (serve_app.runtime.serve_bypass).
@@ -19,6 +20,7 @@ from ray.serve import Application
 from ray.serve.handle import DeploymentHandle
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
+from starlette.middleware.cors import CORSMiddleware
 from starlette.responses import RedirectResponse
 from starlette.routing import Match, Router
 from starlette.types import Receive, Scope, Send
@@ -35,7 +37,7 @@ from serve_app.access.errors import ErrorHandlers
 from serve_app.access.permissions import Permissions
 from serve_app.evaluation_client import EvaluationClient, ServeEvaluationClient
 from serve_app.inference import stream_session
-from serve_app.inference.stream_session import StreamDependencies
+from serve_app.inference.stream_session import InferenceDependencies
 from serve_app.inference_protocol import grpc_handlers, inference
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.grpc_service import InferenceService
@@ -43,8 +45,10 @@ from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.rest import InferRoute, RestRoutes
 from serve_app.inference_protocol.statistics import REPORT
 from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.polling import Polling
 from serve_app.live_versions.registry_connection import RegistryConnection
 from serve_app.live_versions.registry_watcher import RegistryWatcher, WatchedState
+from serve_app.live_versions.remote_search import SearchClient
 from serve_app.live_versions.resolver import ModelResolver
 from serve_app.live_versions.shadow import Shadow
 from serve_app.live_versions.traffic_split import TrafficSplit
@@ -60,6 +64,8 @@ from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.events import EventBroker, EventRoutes
 from serve_app.routes.games import GameRoutes
 from serve_app.routes.pages import DocsRoutes, PageRoutes
+from serve_app.routes.plain_action import PlainActions
+from serve_app.routes.simulate import SimulateRoute
 from serve_app.routes.status import StatusRoutes
 from serve_app.routes.stream import StreamRoute
 from serve_app.routes.table import OF_REGISTRY, ROUTES
@@ -79,18 +85,26 @@ would delay the slowest requests by as much."""
 
 def build_app(args: ServeSettings) -> Application:
     """The Serve application. `args` in deploy.yaml are fields of ServeSettings. Raises ConfigError."""
-    evaluation_service: Application | None = None
-    if args.evaluation_service is not None:
-        # It is imported by name so that serve_app does not depend on it.
-        module, _, name = args.evaluation_service.partition(":")
-        try:
-            bind = getattr(import_module(module), name)
-            evaluation_service = bind(args.evaluation_workers, args.evaluations_at_once)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigError(
-                f"deploy.yaml: args: evaluation_service {args.evaluation_service!r} cannot be imported: {error}"
-            ) from error
-    return serve.deployment(serve.ingress()(PolicyServer)).bind(args, evaluation_service, installed_with_this())
+    evaluations = _bound(
+        "evaluation_service", args.evaluation_service, args.evaluation_workers, args.evaluations_at_once
+    )
+    searches = _bound("search_service", args.search_service, args.search_processes)
+    return serve.deployment(serve.ingress()(PolicyServer)).bind(args, evaluations, searches, installed_with_this())
+
+
+def _bound(setting: str, service: str | None, *args: int) -> Application | None:
+    """A deployment that a setting names. It is imported by name so that serve_app does not depend on it.
+
+    Raises ConfigError.
+    """
+    if service is None:
+        return None
+    module, _, name = service.partition(":")
+    try:
+        application: Application = getattr(import_module(module), name)(*args)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"deploy.yaml: args: {setting} {service!r} cannot be imported: {error}") from error
+    return application
 
 
 class PolicyServer(ray_serve.AsgiReplica):
@@ -100,7 +114,11 @@ class PolicyServer(ray_serve.AsgiReplica):
     """
 
     def __init__(
-        self, settings: ServeSettings, evaluation_service: DeploymentHandle | None, stack: dict[str, str]
+        self,
+        settings: ServeSettings,
+        evaluation_service: DeploymentHandle | None,
+        search_service: DeploymentHandle | None,
+        stack: dict[str, str],
     ) -> None:
         check_deployed_stack(stack, ray_serve.node_address())
         sys.setswitchinterval(SWITCH_INTERVAL)
@@ -113,6 +131,7 @@ class PolicyServer(ray_serve.AsgiReplica):
             ray_serve.replica_id(),
             ray_serve.replica_process(),
             evaluation_service and ServeEvaluationClient(evaluation_service, settings.timeout),
+            search_service and SearchClient(search_service, settings.search_processes),
         )
         self._load = LoadSampler(self._replica.metrics)
         self._count_requests = ray_serve.request_counter()
@@ -121,7 +140,7 @@ class PolicyServer(ray_serve.AsgiReplica):
         """The application of this replica."""
         application = self._replica.application()
         serve_bypass.install(application, self._replica.settings.root_path)
-        uvicorn_http.install(self._replica.events.end)
+        uvicorn_http.install(self._replica.events.end, self._replica.plain_actions)
         uvicorn_websocket.install(self._replica.settings.max_body, self._replica.settings.max_incomplete)
         grpc_handlers.install(self._replica.inference_service)
         gc.freeze()  # permanent objects: collecting them again and again would stall the event loop
@@ -146,7 +165,7 @@ class Replica:
     """The components of a replica. Independent of Ray.
 
     process: The process of the replica; by default this one, known by its machine.
-    evaluation_client: None without an evaluation service.
+    evaluation_client, search_client: None without the service.
     """
 
     def __init__(
@@ -156,6 +175,7 @@ class Replica:
         replica: str,
         process: ReplicaProcess | None = None,
         evaluation_client: EvaluationClient | None = None,
+        search_client: SearchClient | None = None,
     ) -> None:
         process = process or this_process()
         self.registry = registry
@@ -169,6 +189,8 @@ class Replica:
                 inline=settings.inline,
                 selections=selections,
                 timeout=min(settings.run_timeout, settings.timeout),
+                search=search_client,
+                load_timeout=settings.load_timeout,
             ),
             settings.cached_versions,
             settings.retry,
@@ -197,14 +219,21 @@ class Replica:
         )
         self.access = AccessControl(self.api_keys, settings, Permissions(ROUTES), process.is_exposed)
         self.action = ActionRoute(self.models, self.access, self.shadow, self.metrics, settings, replica)
-        dependencies = StreamDependencies(
+        dependencies = InferenceDependencies(
             self.models, self.alias_slots, self.traffic, self.shadow, self.metrics, self.access, settings
         )
-        self.stream = StreamRoute(dependencies, replica, process.is_draining)
+        # With an access log, the application answers all requests, and writes it.
         self.inference = Inference(self.models, self.shadow, self.metrics, settings)
+        self.plain_actions = (
+            None if self.access_log else PlainActions(self.action, self.inference, dependencies, self.errors, replica)
+        )
+        self.stream = StreamRoute(dependencies, replica, process.is_draining)
+        self.simulate = SimulateRoute(self.models, self.access, settings, process.is_draining)
         self.reporter = MetricsReporter(self.connection, self.metrics, self.shadow, self._statistics, replica, settings)
         self._load = LoadSampler(self.metrics)
         self._evaluation_client = evaluation_client
+        self._search_client = search_client
+        self._evaluations = Polling(self._start_evaluations, "evaluations", settings.heartbeat, settings.poll_slowest)
         self.events = EventBroker(self.models, settings)
         self.catalogue = ModelCatalogue(self.models, self.versions, self.inference, settings, self.reporter.report)
         self.inference_service = InferenceService(
@@ -217,6 +246,7 @@ class Replica:
             "action": self.action.in_flight,
             "infer": self.inference.in_flight,
             "stream": self.stream.connections.open,
+            "simulate": self.simulate.connections.open,
             "events": self.events.connections.open,
         }
         return {
@@ -230,6 +260,7 @@ class Replica:
         owners = (
             self.action,
             self.stream,
+            self.simulate,
             InferRoute(self.inference, self.access, self.settings, self.replica),
             RestRoutes(self.inference, self.catalogue, self.watcher),
             *OF_REGISTRY,
@@ -241,9 +272,14 @@ class Replica:
             DocsRoutes(self.alias_slots, self.access, partial(document, self.settings)),
             PageRoutes(),
         )
+        origins = self.settings.cors_origins
+        cors = Middleware(
+            CORSMiddleware, allow_origins=origins, allow_methods=("*",), allow_headers=("*",), expose_headers=("*",)
+        )
         application = Starlette(
             routes=[route for owner in owners for route in routes_of(owner, self.models)],
             middleware=[
+                *([cors] if origins else []),
                 Middleware(AccessControlMiddleware, self.access, self.errors, self.settings, self.access_log),
                 Middleware(ActionDispatch, self.action),
             ],
@@ -253,16 +289,25 @@ class Replica:
         _redirect_slashes(application.router)
         return application
 
+    async def _start_evaluations(self) -> None:
+        """Start the evaluation service if there is something to do. Raises StorageError."""
+        self._evaluations.mark_ready()
+        if self._evaluation_client is not None and await self.connection.call(Registry.needs_evaluation_service):
+            self._evaluation_client.notify()
+
     @asynccontextmanager
     async def _running(self, _: Starlette) -> AsyncIterator[None]:
         try:
             async with AsyncExitStack() as running:
                 if self.access_log is not None:
                     await running.enter_async_context(self.access_log.writing())
+                if self._search_client is not None:
+                    await running.enter_async_context(self._search_client.running())
                 await running.enter_async_context(self.watcher.watching())
                 await running.enter_async_context(self.reporter.reporting())
                 await running.enter_async_context(self.events.watching())
                 await running.enter_async_context(self.stream.checking())
+                await running.enter_async_context(self._evaluations.running())
                 yield
         finally:
             self.shadow.close()

@@ -31,7 +31,7 @@ from league.errors import (
 )
 from league.refs import MAX_SLUG, MAX_VERSION, check_alias, check_slug
 
-Scope = Literal["act", "read", "evaluate", "promote"]
+Scope = Literal["act", "read", "evaluate", "promote", "simulate"]
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
 JSON = ("application/json",)
@@ -318,7 +318,7 @@ class Declaration:
     @property
     def is_change(self) -> bool:
         """Whether it changes what is served or recorded, which always requires a key."""
-        return self.scope in ("evaluate", "promote")
+        return self.scope in ("evaluate", "promote", "simulate") and self.method != "GET"
 
     @property
     def is_applied_once(self) -> bool:

@@ -1,6 +1,7 @@
 """Client of the evaluation service, a separate deployment of the same application that is called by handle."""
 
 import asyncio
+from contextlib import suppress
 from typing import Protocol
 
 from ray.exceptions import RayError, RayTaskError
@@ -18,7 +19,9 @@ class EvaluationClient(Protocol):
     """What routes call."""
 
     def notify(self) -> None:
-        """Report a change in the registry, without waiting. The evaluation service also polls by itself."""
+        """Report a change in the registry, without waiting. This starts the evaluation service, which ends by itself
+        when there is nothing to do.
+        """
 
     async def request_game(self, request: GameRequest) -> GameResponse:
         """Show a game or continue one.
@@ -49,13 +52,25 @@ class ServeEvaluationClient:
 
     def __init__(self, handle: DeploymentHandle, timeout: float) -> None:
         self._handle, self._timeout = handle, timeout
+        self._work: asyncio.Task[None] | None = None
 
     def notify(self) -> None:
         """Report a change. If the service is down, it finds the change after its start."""
         self._handle.notify.remote()
+        self._let_work()
+
+    def _let_work(self) -> None:
+        """Call `work`, unless such a call is in progress. Ray Serve runs the service meanwhile."""
+        if self._work is None or self._work.done():
+            self._work = asyncio.create_task(self._call_work())
+
+    async def _call_work(self) -> None:
+        with suppress(RayError, RayServeException):  # it has ended: the next call starts it again
+            await self._handle.work.remote()
 
     async def request_game(self, request: GameRequest) -> GameResponse:
         """Send a request. Errors return as data, because exceptions would arrive with a traceback as their message."""
+        self._let_work()
         try:
             async with asyncio.timeout(CALL_SHARE * self._timeout):
                 response = await self._handle.request_game.remote(

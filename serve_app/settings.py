@@ -31,6 +31,9 @@ class ServeSettings(BaseModel):
     root_path: str = ""
     """Path below which a proxy serves this server, such as `/ai`. The proxy may leave it in the paths of requests, or
     remove it."""
+    cors_origins: list[str] = []
+    """Origins such as `https://game.example` whose pages may call this server from a browser. All requests then need an
+    API key, which such a page sends like any client, or for a stream as a WebSocket subprotocol."""
     max_body: int = Field(default=4 * 2**20, ge=1024)
     """Larger request bodies are refused with 413, and larger messages close their stream with 1009. A replica may hold
     `max_in_flight` bodies at once, and HAProxy retries a request on another replica only if it fits into
@@ -56,7 +59,7 @@ class ServeSettings(BaseModel):
     run_timeout: float = Field(default=3.0, gt=0)
     """How long a run of a policy's graph may occupy a thread of the replica. It is then ended, after its current
     operator, and the request gets 504. Less than `timeout`, so that the request is not answered before."""
-    max_waiting: int = Field(default=256, ge=1)
+    max_waiting: int = Field(default=1024, ge=1)
     """Inference requests that may wait on the event loop, including those on connections that are not accepted yet. If
     more wait for longer than `burst_tolerance`, the excess is refused with 429."""
     max_turn: float = Field(default=0.025, gt=0)
@@ -105,6 +108,12 @@ class ServeSettings(BaseModel):
     """Evaluations that may be queued or running in all leagues; further ones are refused with 429."""
     max_evaluations_per_league: int = Field(default=8, ge=1)
     """Evaluations of one league that may be queued or running; further ones are refused with 429."""
+    search_service: str | None = None
+    """Import string of the search service; deploy.yaml sets `evaluation.service.search_service:deployment`. None: no
+    search service; search versions are not served, and requests for them get 503."""
+    search_processes: int = Field(default=1, ge=1)
+    """Maximum processes of the search service, which are started as calls wait. They have a lower priority than
+    replicas, but share their cores."""
     inline: float = Field(default=0.001, gt=0)
     """Inference that takes longer runs in a thread, so that it delays neither other requests nor health checks."""
 
@@ -117,8 +126,18 @@ class ServeSettings(BaseModel):
             raise ValueError(f"{path!r} begins like a path of this server: {', '.join(sorted(OWN_PATHS))}")
         return path
 
+    @field_validator("cors_origins")
+    @classmethod
+    def _are_origins(cls, origins: list[str]) -> list[str]:
+        for origin in origins:
+            if not re.fullmatch(r"https?://([a-z0-9.-]+|\[[0-9a-f:.]+\])(:[0-9]{1,5})?", origin):
+                raise ValueError(f"expected an origin like https://game.example:8443 in lower case, got {origin!r}")
+        return origins
+
     @model_validator(mode="after")
     def _in_proportion(self) -> Self:
+        if self.cors_origins and self.require_keys == "never":
+            raise ValueError("cors_origins needs API keys, but require_keys is never: any page could use this server")
         if self.poll_slowest < self.poll:
             raise ValueError(f"poll_slowest must be at least poll ({self.poll:g})")
         if 3 * self.heartbeat > LIVENESS_TIMEOUT.total_seconds():

@@ -393,7 +393,7 @@ def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
 
 TRAINING = {"onnx", "onnxscript", "ray.rllib", "ray.tune", "tensorboard", "torch"}
 """Modules of dependencies that only training imports."""
-TRAINER_EXTRAS = ["environments", "object-store", "openspiel", "postgres"]
+TRAINER_EXTRAS = ["environments", "object-store", "openspiel", "optuna", "postgres"]
 ONLY_IN_TRAINER = {*TRAINING, "pyspiel", "rlcard"}
 """Modules that the server's image lacks."""
 

@@ -20,6 +20,7 @@ from typer.core import TyperGroup
 
 from league.config.algorithms import ALGORITHMS
 from league.config.league import LeagueConfig
+from league.config.marwil import MARWILConfig
 from policy_league.cli.main import app
 from serve_app.openapi.document import document
 from serve_app.runtime import haproxy_script
@@ -96,14 +97,25 @@ def test_each_json_document_is_described() -> None:
     assert missing == []
 
 
+def test_entries_of_docstrings_describe_the_fields_of_json_documents() -> None:
+    text = MADE[DOCS / "json-documents.md"]()
+    assert "| `bound` | number | What a best response scores at least" in text
+    assert "| `by_side[side][i][j]`: the same" in text
+    assert "`curve`" not in text, "it is not printed"
+    assert not re.findall(r"\. [a-z_]+(?:, [a-z_]+)*: |None", text), "an entry without its field"
+
+
 def test_the_readme_is_short() -> None:
     assert len(README.read_text().splitlines()) <= 120
 
 
-MODULE_INDEX, HTTP_REFERENCE = (
-    runpy.run_path(str(ROOT / f"scripts/{name}.py"))["page"] for name in ("module_index", "http_reference")
-)
-MADE = {DOCS / "modules.md": MODULE_INDEX, DOCS / "http-reference.md": HTTP_REFERENCE}
+MODULE_INDEX = runpy.run_path(str(ROOT / "scripts/module_index.py"))["page"]
+REFERENCES = runpy.run_path(str(ROOT / "scripts/references.py"))
+MADE = {
+    DOCS / "modules.md": MODULE_INDEX,
+    DOCS / "http-reference.md": REFERENCES["http_page"],
+    DOCS / "json-documents.md": REFERENCES["documents_page"],
+}
 """Pages that scripts/mkdocs_hooks.py makes from the code."""
 
 
@@ -190,15 +202,19 @@ def settings_of(heading: str) -> dict[str, str]:
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_each_training_setting_is_documented_with_its_default(name: str) -> None:
     model = ALGORITHMS[name]
-    rows = settings_of("`training`: all algorithms") | settings_of(f"`training` with `algorithm: {name}`")
-    fields = {field.alias or key for key, field in model.model_fields.items()}
-    assert set(rows) == fields
-    for key in fields:
-        if key == "algorithm":
-            continue
+    parts = ["ppo", name] if model is MARWILConfig else [name]
+    rows = settings_of("`training`: all algorithms")
+    for part in parts:
+        rows |= settings_of(f"`training` with `algorithm: {part}`")
+    assert set(rows) == {field.alias or key for key, field in model.model_fields.items()}
+    required = {key: "games" for key, field in model.model_fields.items() if field.is_required() and key != "algorithm"}
+    document = {"algorithm": name} | required
+    assert all(rows[key] == "required" for key in required)
+    unused = MARWILConfig.unused if model is MARWILConfig else ()
+    for key in rows.keys() - document.keys() - set(unused):
         shown = yaml.safe_load(rows[key]) if rows[key] != "–" else None
-        default = model.model_validate({"algorithm": name}).model_dump(by_alias=True)[key]
-        assert model.model_validate({"algorithm": name, key: shown}).model_dump(by_alias=True)[key] == default
+        default = model.model_validate(document).model_dump(by_alias=True)[key]
+        assert model.model_validate(document | {key: shown}).model_dump(by_alias=True)[key] == default
 
 
 def test_each_module_is_in_the_module_index() -> None:

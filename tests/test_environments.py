@@ -11,6 +11,7 @@ import pytest
 from evaluation.matches import tournament
 from league.config.league import LeagueConfig
 from league.environments.building import interface
+from league.environments.conformance import examination
 from league.environments.conformance.examination import examine
 from league.policies import load
 from league.registry.registry import Registry
@@ -58,14 +59,14 @@ def _cases() -> list[Any]:
 
 
 @pytest.mark.parametrize("case", _cases())
-@pytest.mark.usefixtures("ray_session")
+@pytest.mark.usefixtures("ray_session", "parsed_operators")
 def test_trains_publishes_evaluates_and_loads(case: Case, registry: Registry, tmp_path: Path) -> None:
     _train_publish_evaluate_and_load(case.league(), registry, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("game", GAMES)
-@pytest.mark.usefixtures("ray_session")
+@pytest.mark.usefixtures("ray_session", "parsed_operators")
 def test_games_of_openspiel_train_publish_and_evaluate(game: str, registry: Registry, tmp_path: Path) -> None:
     pytest.importorskip("pyspiel")
     league = Case("openspiel", {"game": game}).league()
@@ -75,7 +76,9 @@ def test_games_of_openspiel_train_publish_and_evaluate(game: str, registry: Regi
 @pytest.mark.slow
 @pytest.mark.parametrize("entry_point", [case.entry_point for case in CASES])
 @pytest.mark.usefixtures("ray_session")
-def test_an_entry_point_alone_is_enough(entry_point: str) -> None:
+def test_an_entry_point_alone_is_enough(entry_point: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(examination, "COMPARED_STEPS", 500)  # other tests compare thousands
+    monkeypatch.setattr(examination, "MEASURED_SECONDS", 0.01)
     alone = LeagueConfig.from_mapping({"league": "alone", "environment": {"entry_point": entry_point}})
     assert examine(alone, episodes=1, steps=50).passed
     short = alone.with_training(runners=0, num_envs=1, train_batch_size=32, minibatch_size=32, epochs=1, hidden=(8,))

@@ -56,6 +56,6 @@ def test_a_release_is_built_as_in_ci_and_attested() -> None:
     commands = [step.get("run", "") for step in steps("release.yml")]
     targets = re.findall(r"^make ([\w-]+)", "\n".join(commands), flags=re.M)
     assert targets == ["setup", "dist", "test-slow"]
-    assert "make dist\n" in (ROOT / ".ci/run").read_text()
+    assert re.search(r"^make .*\bdist$", (ROOT / ".ci/run").read_text(), flags=re.M)
     attested = [step["with"]["subject-path"] for step in steps("release.yml") if "attest" in step.get("uses", "")]
     assert attested == ["dist/*"]

@@ -105,19 +105,14 @@ def test_doctor(run: Installed) -> None:
 
 
 def test_demo(run: Installed) -> None:
+    """It trains a bundled configuration, evaluates and serves."""
     process = run("demo", "--minutes", "0.2", "--exit", "--port", str(free_ports(1)[0]))
     assert process.returncode == 0, process.stdout + process.stderr
     assert re.search(r"The champion (won|lost)\.|draw", process.stdout), process.stdout
 
 
-def test_train_by_name(run: Installed) -> None:
-    process = run("train", "connect_four", "--minutes", "0.1", "--runners", "0")
-    assert process.returncode == 0, process.stdout + process.stderr
-    assert "Published connect_four@" in process.stdout
-
-
 @pytest.mark.parametrize("arguments", [("check-env", "two_step_game"), ("nightly", "cars_and_lights")], ids=" ".join)
-def test_other_commands_with_the_environments_of_the_examples(run: Installed, arguments: tuple[str, ...]) -> None:
+def test_commands_with_the_environments_of_the_examples(run: Installed, arguments: tuple[str, ...]) -> None:
     process = run(*arguments)
     assert process.returncode == 0, process.stdout + process.stderr
 
@@ -126,12 +121,6 @@ def test_a_misspelled_name_lists_the_bundled_configurations(run: Installed) -> N
     process = run("train", "conect_four")
     assert process.returncode == 2
     assert "connect_four, " in process.stderr
-
-
-def test_serve(league: Path, directory: Path) -> None:
-    with served(league, directory) as url:
-        for page in ("/", "/docs", "/openapi.json", "/v1/leagues"):
-            assert httpx.get(url + page, follow_redirects=True).status_code == 200, page
 
 
 GAME = """
@@ -168,6 +157,8 @@ def test_the_image_of_the_server_evaluates_and_plays_and_the_client_alone_calls_
         )
         assert process.returncode == 0, process.stdout + process.stderr
     with served(server, tmp_path) as url:
+        for page in ("/", "/docs", "/openapi.json", "/v1/leagues"):
+            assert httpx.get(url + page, follow_redirects=True).status_code == 200, page
         process = subprocess.run(
             [client, "-c", GAME, url], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=120
         )

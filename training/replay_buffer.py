@@ -165,11 +165,12 @@ class ReplayBuffer:
         if self._tree is not None:
             self._tree.set(indices, self._largest)
 
-    def sample(self, size: int, *, n_step: int = 1, gamma: float = 1.0, beta: float = 1.0) -> Sample:
-        """Sample `size` transitions with replacement.
+    def sample(self, size: int, *, draws: int = 1, n_step: int = 1, gamma: float = 1.0, beta: float = 1.0) -> Sample:
+        """Sample `size` transitions with replacement, `draws` times; return all draws, concatenated.
 
         Args:
             size: k.
+            draws: The number of samples, each drawn as if alone.
             n_step: Maximum number of steps of the returns.
             gamma: Discount factor.
             beta: Exponent of the importance weights for prioritised replay (equation 1 and section 3.4 of Schaul et
@@ -177,13 +178,15 @@ class ReplayBuffer:
                 w_i = (N P(i))^−β, divided by the largest of the sample.
         """
         if self._tree is None:
-            indices = self._rng.integers(len(self), size=size)
-            weights = np.ones(size, dtype=np.float32)
+            indices = self._rng.integers(len(self), size=draws * size)
+            weights = np.ones(draws * size, dtype=np.float32)
         else:
-            # One draw from each of k equal segments of the total, as in appendix B.2.1.
-            indices = self._tree.find((np.arange(size) + self._rng.random(size)) * (self._tree.total / size))
+            # One row from each of k equal segments of the total, as in appendix B.2.1.
+            places = np.arange(size) + self._rng.random((draws, size))
+            indices = self._tree.find((places * (self._tree.total / size)).ravel())
             scaled = (self._tree.get(indices) * (len(self) / self._tree.total)) ** -beta
-            weights = (scaled / scaled.max()).astype(np.float32)
+            scaled = scaled.reshape(draws, size)
+            weights = (scaled / scaled.max(axis=1, keepdims=True)).astype(np.float32).ravel()
         return Sample(self.rows(indices, n_step=n_step, gamma=gamma), indices, weights)
 
     def sample_sequences(self, size: int, length: int, *, gamma: float = 1.0) -> Sample:
@@ -213,7 +216,8 @@ class ReplayBuffer:
             if name.startswith(REWARDS):
                 rows[name] = rewards[name]
             else:
-                rows[name] = column[lasts if name.startswith((NEXT, *FLAGS)) else indices]
+                # Several times faster than indexing by arrays.
+                rows[name] = column.take(lasts if name.startswith((NEXT, *FLAGS)) else indices, axis=0)
         rows[DISCOUNTS] = (gamma**steps).astype(np.float32)
         return rows
 
@@ -278,7 +282,7 @@ class ReplayBuffer:
     def _returns(self, indices: NDArray, n_step: int, gamma: float) -> tuple[NDArray, NDArray, Rows]:
         """Return the last row and the number of steps of each return, (k,), and the discounted reward sums, float32."""
         subcolumns = [name for name in self._columns if name.startswith(REWARDS)]
-        rewards = {name: self._columns[name][indices].astype(np.float32) for name in subcolumns}
+        rewards = {name: self._columns[name].take(indices, axis=0).astype(np.float32) for name in subcolumns}
         flags = [column for name, column in self._columns.items() if name.startswith(FLAGS)]
         lasts, steps = indices.copy(), np.ones(len(indices), dtype=np.int64)
         going = np.arange(len(indices))

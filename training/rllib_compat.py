@@ -1,6 +1,6 @@
-"""Wraps the private and undocumented parts of RLlib and Tune, the only place that uses them.
+"""Wraps the private and undocumented parts of RLlib, Tune and torch, the only place that uses them.
 
-Each function or class names the internal or the upstream fault that it relies on, as of Ray 2.60.
+Each function or class names the internal or the upstream fault that it relies on, as of Ray 2.60 and torch 2.13.
 tests/training/test_rllib_compat.py fails where an internal has changed, tests/training/test_rllib_faults.py where a
 fault has been fixed upstream.
 """
@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import ray
 import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
@@ -26,6 +27,7 @@ from ray.rllib.env.env_runner import EnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.checkpoints import Checkpointable
+from ray.tune.execution.class_cache import _ActorClassCache
 from ray.tune.experiment import Trial
 from ray.tune.logger.tensorboardx import TBXLoggerCallback
 from ray.tune.search.variant_generator import generate_variants as generate_variants
@@ -171,6 +173,10 @@ class ExplicitConfig(AlgorithmConfig):
         return TorchLearner
 
 
+fused_adam = torch._fused_adam_
+"""The kernel of `torch.optim.Adam.step`, which prepares for several tensors for as long."""
+
+
 def local_learner(algorithm: Algorithm) -> Any:
     """Return the learner in the algorithm's process (`num_learners=0`). Reads the private `LearnerGroup._learner`."""
     return algorithm.learner_group._learner
@@ -249,6 +255,15 @@ def silence_tune() -> None:
     os.environ.update(TUNE_ENVIRONMENT)
     for name, level in LOG_LEVELS.items():
         logging.getLogger(name).setLevel(level)
+
+
+def use_waiting_workers() -> None:
+    """Let Tune start trials without a runtime environment, in a worker that already waits for a task.
+
+    Only for a local Ray, whose workers inherit the variables that Tune would set. Replaces the private
+    `_ActorClassCache.get`.
+    """
+    _ActorClassCache.get = lambda cache, trainable: cache._cache.setdefault(trainable, ray.remote(trainable))
 
 
 def silence_job_submission() -> None:

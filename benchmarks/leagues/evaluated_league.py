@@ -12,7 +12,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest, Parity, PolicyManifest
 from league.registry.storage.rows import LeagueRow
 from league.settings import Storage
-from training.algorithms.ppo import module_spec
+from training.algorithms.rllib_config import module_spec
 from training.export.onnx_export import export_policy, graph_tensors
 from training.modules.actor_critic import ActorCritic
 

@@ -6,15 +6,18 @@ Each request costs it a few microseconds.
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from random import random
 from typing import cast
 from urllib.parse import urlsplit
 
 import numpy as np
+import orjson
+from numpy.typing import NDArray
 
 from benchmarks.load.elsewhere import run_elsewhere
+from league.policies.open_inference import DATATYPES
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +43,7 @@ OnReply = Callable[[int, bytes, float], bool]
 
 
 JSON = {"Content-Type": "application/json"}
+BINARY = {"Content-Type": "application/octet-stream"}
 LENGTH = b"content-length: "
 LAST_CHUNK = b"0\r\n\r\n"
 
@@ -116,6 +120,23 @@ def post(url: str, body: bytes, headers: Mapping[str, str] = JSON) -> bytes:
     lines = [f"POST {path} HTTP/1.1", f"Host: {parts.netloc}", f"Content-Length: {len(body)}"]
     lines += [f"{name}: {value}" for name, value in headers.items()]
     return "\r\n".join(lines).encode() + b"\r\n\r\n" + body
+
+
+def binary(arrays: Mapping[str, NDArray], outputs: Sequence[str] = ("action",)) -> tuple[bytes, dict[str, str]]:
+    """A request of the Open Inference Protocol with the binary tensor extension: its body and its headers."""
+    inputs = [
+        {
+            "name": name,
+            "shape": list(array.shape),
+            "datatype": DATATYPES[array.dtype.name],
+            "parameters": {"binary_data_size": array.nbytes},
+        }
+        for name, array in arrays.items()
+    ]
+    wanted_outputs = [{"name": name, "parameters": {"binary_data": True}} for name in outputs]
+    head = orjson.dumps({"inputs": inputs, "outputs": wanted_outputs})
+    body = head + b"".join(array.tobytes() for array in arrays.values())
+    return body, BINARY | {"Inference-Header-Content-Length": str(len(head))}
 
 
 async def drive(

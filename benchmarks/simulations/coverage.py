@@ -8,7 +8,7 @@ from benchmarks.simulations.simulated_gates import CELLS, EQUALS, stronger
 from evaluation.statistics.bradley_terry import rate
 from evaluation.statistics.improvement import iqm, probability_of_improvement, stratified_bootstrap
 from evaluation.statistics.sequential import elo_estimate, elo_of
-from league.results.records import BlockResult
+from league.results.records import Outcome
 
 BLOCKS = 200
 TRUTH = 40.0
@@ -45,11 +45,11 @@ def rating(simulations: int, seed: int) -> float:
     return float(np.mean(covered))
 
 
-def _blocks(pair: str, truth: dict[str, float], rng: np.random.Generator) -> list[BlockResult]:
+def _blocks(pair: str, truth: dict[str, float], rng: np.random.Generator) -> list[Outcome]:
     first, second = pair
     shares = stronger(EQUALS["decisive"], truth[first] - truth[second], "logistic")
     points = 2 * CELLS[rng.choice(5, p=shares, size=BLOCKS)]
-    return [BlockResult("s", i, (first, second), 2, (float(p), float(2 - p)), (0.0, 0.0)) for i, p in enumerate(points)]
+    return [Outcome((first, second), 2, (float(p), float(2 - p))) for p in points]
 
 
 def interquartile_mean(simulations: int, seed: int) -> float:

@@ -6,14 +6,14 @@ Three leagues, with blocks of two games drawn from the logistic model:
 - adaptive: each version has played those of similar strength;
 - round robin: each pair has played once, 499,500 pairs.
 
-Measured is `evaluation.matches.leaderboard.ranked`: sums, ratings, and their 95 % intervals, from blocks in memory. In
-addition, the round robin is written to a ledger, a SQLite file, and measured again from there. Target: 10 s each.
+Measured is `evaluation.matches.leaderboard.rank_contestants`: ratings and their 95 % intervals, from sums in memory. In
+addition, the sums of the round robin are read from a ledger, a SQLite file. Target: 10 s each.
 """
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from datetime import UTC, datetime
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from league.registry.registry import Registry
 from league.registry.storage import tables
 from league.registry.storage.database import insert
 from league.results.ledger import Ledger
-from league.results.records import BlockResult, Game, dump_games, dump_numbers
+from league.results.sums import Pair, PairSums, pair_of, whole
 from league.settings import Storage
 
 SECONDS = 10.0
@@ -46,18 +46,20 @@ def run(quick: bool) -> Iterator[Target]:
     truth = np.cumsum(rng.normal(2, 6, versions)) * np.log(10) / 400
     for name, draw in LEAGUES.items():
         pairs = draw(versions, truth, rng)
-        results = _blocks(pairs, truth, rng)
-        yield _rated(name, pairs, lambda results=results: results)
+        sums = _sums(pairs, truth, rng)
+        yield _rated(name, pairs, lambda sums=sums: sums)
     if not quick:
         with tempfile.TemporaryDirectory() as scratch:
-            registry = _written(Path(scratch), results)
-            yield _rated("round robin from its ledger", pairs, lambda: Ledger(registry).results(LEAGUE))
+            registry = _written(Path(scratch), sums)
+            ledger = Ledger(registry)
+            schedules = ledger.schedules(LEAGUE)
+            yield _rated("round robin from its ledger", pairs, lambda: ledger.sums(LEAGUE, schedules))
             registry.close()
 
 
-def _rated(name: str, pairs: Pairs, read: Callable[[], list[BlockResult]]) -> Target:
+def _rated(name: str, pairs: Pairs, read: Callable[[], dict[Pair, PairSums]]) -> Target:
     began = time.perf_counter()
-    table = rank_contestants(read())
+    table = rank_contestants(whole(read()))
     seconds = time.perf_counter() - began
     assert all(standing.interval is not None for standing in table)
     note = f"{2 * len(pairs):,} games of {len(np.unique(np.sort(pairs, axis=1), axis=0)):,} pairs"
@@ -90,42 +92,32 @@ def _name(version: int) -> str:
     return f"{LEAGUE}@{version}" if version else "script:random"
 
 
-def _blocks(pairs: Pairs, truth: NDArray[np.float64], rng: np.random.Generator) -> list[BlockResult]:
+def _sums(pairs: Pairs, truth: NDArray[np.float64], rng: np.random.Generator) -> dict[Pair, PairSums]:
     won = rng.binomial(2, expit(truth[pairs[:, 0]] - truth[pairs[:, 1]])).tolist()
-    return [
-        BlockResult(
-            "schedule", at, (_name(i), _name(j)), 2, (float(points), 2.0 - points), (2.0 * points - 2, 2 - 2.0 * points)
-        )
-        for at, ((i, j), points) in enumerate(zip(pairs.tolist(), won, strict=True))
-    ]
+    sums: defaultdict[Pair, PairSums] = defaultdict(PairSums)
+    for (i, j), wins in zip(pairs.tolist(), won, strict=True):
+        names = _name(i), _name(j)
+        pair = pair_of(names)
+        points = wins if pair == names else 2 - wins
+        sums[pair].matches += 1
+        sums[pair].whole.count((2 * points, 4 - 2 * points), 2, (2 * points - 2, 2 - 2 * points), 1)
+    return dict(sums)
 
 
-def _written(scratch: Path, results: Sequence[BlockResult]) -> Registry:
-    """A ledger with a round robin of these results; most moves are omitted, as they are not read."""
+def _written(scratch: Path, sums: Mapping[Pair, PairSums]) -> Registry:
+    """A ledger with the sums of a round robin, without its matches, as they are not read."""
     config = LeagueConfig.from_mapping(
         {"league": LEAGUE, "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"}}
     )
     registry = Registry.open(Storage.at(scratch / "home"))
     registry.leagues.register(config, interface(config))
-    contestants = list(dict.fromkeys(ref for block in results for ref in block.contestants))
+    contestants = list(dict.fromkeys(ref for pair in sums for ref in pair))
     schedule = Ledger(registry).open(round_robin(config, interface(config), contestants, blocks=1))
-    moves = dump_games([Game((i, 1 - i), 1, (), (4, 0, 8), (1.0, -1.0), (1.0, 0.0)) for i in range(2)])
-    for start in range(0, len(results), BATCH):
-        rows = [
-            {
-                "schedule": schedule.id,
-                "position": block.position,
-                "league": LEAGUE,
-                "first": block.contestants[0],
-                "second": block.contestants[1],
-                "games": block.games,
-                "scores": dump_numbers(block.scores),
-                "returns": dump_numbers(block.returns),
-                "moves": moves,
-                "played_at": datetime.now(UTC),
-            }
-            for block in results[start : start + BATCH]
-        ]
+    rows = [
+        {"schedule": schedule.id, "league": LEAGUE, "first": first, "second": second, "sums": of_pair.dump()}
+        for (first, second), of_pair in sums.items()
+    ]
+    for start in range(0, len(rows), BATCH):
         with registry.database.write() as session:
-            insert(session, tables.MatchTable, rows)
+            insert(session, tables.PairSumTable, [row | {"examples": "[]"} for row in rows[start : start + BATCH]])
     return registry

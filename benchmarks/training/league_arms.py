@@ -17,7 +17,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.harness import CONFIGS, Target
-from benchmarks.training.learned import one_thread, two_at_once
+from benchmarks.training.learned import in_processes, one_thread
 from evaluation.documents import ExploiterScore
 from evaluation.gating.criteria.exploitability import exploitability
 from evaluation.matches.worker import MatchWorker
@@ -75,7 +75,7 @@ def compare_arms(minutes: float, seeds: Sequence[int] = SEEDS) -> Iterator[Targe
     for seed in seeds:
         with tempfile.TemporaryDirectory() as home:
             jobs = [ArmJob(name, seed, minutes, Path(home) / name) for name in (LEAGUE, SELF_PLAY)]
-            for job, arm in zip(jobs, two_at_once(work, jobs), strict=True):
+            for job, arm in zip(jobs, in_processes(work, jobs), strict=True):
                 arms[job.name].append(arm)
                 best = arm.exploiter
                 note = f"{arm.steps:,} actions; exploiter {best.score:.3f} [{best.low:.3f}, {best.high:.3f}]"

@@ -145,10 +145,10 @@ def _parameters(algorithm: Algorithm) -> int:
     return sum(unique.values())
 
 
-def two_at_once(work: Callable[[Work], Result], jobs: Sequence[Work]) -> Iterator[Result]:
-    """Run each job in a subprocess, two at a time; yields the results in the order of the jobs."""
+def in_processes(work: Callable[[Work], Result], jobs: Sequence[Work], at_once: int = 2) -> Iterator[Result]:
+    """Run each job in a subprocess, some at a time; yields the results in the order of the jobs."""
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(2, mp_context=spawn, max_tasks_per_child=1) as pool:
+    with ProcessPoolExecutor(at_once, mp_context=spawn, max_tasks_per_child=1) as pool:
         yield from pool.map(work, jobs)
 
 

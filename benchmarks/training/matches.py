@@ -1,9 +1,11 @@
 """Games of a newly trained policy, like those of matches: its exported graph, greedily, on each side in turn."""
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from ray.rllib.algorithms.algorithm import Algorithm
+from scipy.stats import binomtest
 
 from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import round_robin
@@ -42,3 +44,9 @@ def games(trained: Policy, league: LeagueConfig, opponent: str, count: int, seed
     finally:
         environment.close()
     return [game for match in matches for game in match.games]
+
+
+def lower_bound(played: Sequence[Game]) -> float:
+    """The lower limit of Wilson's two-sided 95 % interval of contestant 0's wins, in percent. A draw is not a win."""
+    won = sum(game.scores[0] == 1 for game in played)
+    return float(100 * binomtest(won, len(played)).proportion_ci(0.95, "wilson").low)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 
 from benchmarks.harness import CONFIGS, Target
-from benchmarks.training.learned import greedy_returns, local_ray, one_thread, two_at_once
+from benchmarks.training.learned import greedy_returns, in_processes, local_ray, one_thread
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from policy_league.examples.two_step import ACTIONS, AGENTS, STATES, values
@@ -79,7 +79,7 @@ def two_step_game(scale: float) -> Iterator[Target]:
     seeds = range(max(1, round(SEEDS * scale)))
     gamma = LeagueConfig.load(CONFIG).training.gamma
     jobs = [(mixer, seed) for mixer in RETURNS for seed in seeds]
-    results = dict(zip(jobs, two_at_once(work, jobs), strict=True))
+    results = dict(zip(jobs, in_processes(work, jobs), strict=True))
     for mixer, best in RETURNS.items():
         reached = sum(results[mixer, seed].returned == best for seed in seeds)
         name = f"two_step_game, {mixer}, seeds with return {best:g}"

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from ray.rllib.algorithms.algorithm import Algorithm
-from scipy.stats import binomtest
 
 from benchmarks.harness import CONFIGS, Target
-from benchmarks.training.learned import interval, local_ray, one_thread, two_at_once
+from benchmarks.training.learned import in_processes, interval, local_ray, one_thread
 from benchmarks.training.leduc import best_response, greedy, uniform
-from benchmarks.training.matches import games, graph
+from benchmarks.training.matches import games, graph, lower_bound
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from training.runs.trial import build_algorithm
@@ -56,7 +55,7 @@ def leduc_holdem_dqn(scale: float) -> Iterator[Target]:
 def connect_four_dqn(scale: float) -> Iterator[Target]:
     """The fraction of wins against random play with openings, and whether any of a million moves was illegal."""
     outcomes = _work(_connect_four, scale)
-    lows = tuple(round(100 * outcome.measured["low"], 2) for outcome in outcomes)
+    lows = tuple(round(outcome.measured["low"], 2) for outcome in outcomes)
     # An illegal move would have ended the games with an error.
     note = f"{sum(outcome.measured['moves'] for outcome in outcomes):,.0f} legal moves"
     yield Target("connect_four_dqn against random play, lower bound", lows, "%", at_least=95.0, note=note)
@@ -64,7 +63,7 @@ def connect_four_dqn(scale: float) -> Iterator[Target]:
 
 def _work(train: Callable[[tuple[int, float]], Outcome], scale: float) -> list[Outcome]:
     """Run each seed on one core."""
-    return list(two_at_once(train, [(seed, scale) for seed in SEEDS]))
+    return list(in_processes(train, [(seed, scale) for seed in SEEDS]))
 
 
 def _against_random(job: tuple[int, float]) -> Outcome:
@@ -90,9 +89,7 @@ def _connect_four(job: tuple[int, float]) -> Outcome:
             moves += sum(len(game.actions) // 2 for game in games(trained, league, opponent, 10 * GAMES, round_))
             if moves >= MOVES * min(1.0, 10 * job[1]):
                 break
-        won = [game.scores[0] for game in first].count(1.0)
-        low = binomtest(won, len(first)).proportion_ci(0.95, "wilson").low
-        return {"won": won / len(first), "low": low, "games": len(first), "moves": moves}
+        return {"low": lower_bound(first), "moves": moves}
 
     return _train("connect_four_dqn", *job, measure)
 

@@ -34,6 +34,8 @@ from league.errors import (
     FilesMissing,
     GameCrashed,
     GameHung,
+    GraphTimeout,
+    InvalidInput,
     NotFound,
     ObservationError,
     RemoteError,
@@ -41,10 +43,12 @@ from league.errors import (
 )
 from league.policies.loading import check_contestants, eligible
 from league.ray_cluster import ray_session
-from league.refs import CHAMPION
+from league.refs import CHAMPION, CheckpointRef
 from league.registry.registry import Registry
+from league.registry.storage.manifest import SearchSettings
 from league.registry.storage.rows import LeagueRow, NightlyRunRow, VerdictRow, VersionRow
 from league.results.ledger import Ledger
+from league.search.policies import publish_search
 
 RATING_BLOCKS = 32
 """Matches of a new version against each opponent for its rating, in addition to those of its verdict."""
@@ -56,6 +60,7 @@ CONTESTANT_FAULTS = (
     ExploiterMissing,
     GameCrashed,
     GameHung,
+    GraphTimeout,
     NotFound,
     ObservationError,
     RemoteError,
@@ -74,6 +79,7 @@ class NightlyReport(Document):
     confirmations: confirmation matches played in this run.
     alpha_spent: by all verdicts of the last 365 days, of the gate's `alpha`.
     faults: versions that could not be gated or rated, with the reasons; they are retried in the next run.
+    leaderboard: at the end of the gate, without `unique_games`.
     """
 
     league: str
@@ -101,8 +107,9 @@ def nightly(
 ) -> NightlyReport:
     """Gate all versions without a verdict, oldest first, each against the current champion.
 
-    Without a champion, the opponent is `script:random`. Each new version then plays a short gauntlet for its rating. A
-    version that cannot play is reported as a fault.
+    Without a champion, the opponent is `script:random`. If the champion is a search version, a version with a value
+    graph is tested with the same search, for which a search version is published. Each new version then plays a short
+    gauntlet for its rating. A version that cannot play is reported as a fault.
 
     Args:
         config: Configuration of the league.
@@ -189,8 +196,8 @@ class _NightlyRun:
 
     def _waiting(self) -> list[int]:
         """Versions that the current nightly run does not include."""
-        numbers = [version.number for version in self._untested()]
-        return [number for number in numbers if self._row is None or number not in self._row.candidates]
+        untested = self._untested()
+        return [version.number for version in untested if self._row is None or not self._includes(self._row, version)]
 
     def _begin(self, candidates: list[int]) -> NightlyRunRow | None:
         """Open a nightly run. None if the α of the year is spent."""
@@ -220,12 +227,11 @@ class _NightlyRun:
         # Without a limit of nightly runs, verdicts do not count against the α of a year.
         number = None if league.config.gate.nights is None else nightly_run.id
         for version in self._untested():
-            if version.number in nightly_run.candidates:
+            if self._includes(nightly_run, version):
                 with self._faults_of(version.ref):
                     opponent, alpha = self.champion() or ANCHOR, nightly_run.alpha
-                    self._conclude(
-                        verdicts.open_verdict(self._registry, league, version.number, opponent, alpha, number)
-                    )
+                    candidate = self._with_the_search_of_the_champion(version).number
+                    self._conclude(verdicts.open_verdict(self._registry, league, candidate, opponent, alpha, number))
 
     def confirm(self) -> None:
         """Play the missing confirmation matches of promotions."""
@@ -265,15 +271,57 @@ class _NightlyRun:
                     )
 
     def _untested(self) -> list[VersionRow]:
-        """Versions without an effective verdict that are not champion and were not rolled back, oldest first."""
+        """Versions without an effective verdict that are not champion and were not rolled back, oldest first.
+
+        Those that exist with the search of the champion are candidates only with it, and in the order without it.
+        Those that were tested with the search of an earlier champion are tested.
+        """
         league, champion = self._league.slug, self.champion()
         former = rolled_back(self._registry.aliases.history(league))
-        tested = {row.candidate for row in self._registry.verdicts.all(league) if verdicts.is_effective(row)}
-        return [
+        versions = self._registry.versions.all(league)
+        searches = {version.ref: version.search for version in versions if version.search is not None}
+        tested: set[int] = set()
+        for row in self._registry.verdicts.all(league):
+            if verdicts.is_effective(row):
+                tested.add(row.candidate)
+                search, opponent = searches.get(f"{league}@{row.candidate}"), searches.get(row.champion)
+                if search is not None and opponent is not None and _are_alike(search, opponent):
+                    tested.add(search.version)
+        searched = {self._number_without_search(version) for version in versions if version.retired_at is None}
+        excluded = former | tested | searched
+        untested = [
             version
             for version in eligible(self._registry, league)
-            if version.ref != champion and version.number not in former | tested
+            if version.ref != champion and version.number not in excluded
         ]
+        return sorted(untested, key=lambda version: self._number_without_search(version) or version.number)
+
+    def _champions_search(self) -> SearchSettings | None:
+        champion = self.champion()
+        return None if champion is None else self._registry.versions.resolve(CheckpointRef.parse(champion)).search
+
+    def _with_the_search_of_the_champion(self, version: VersionRow) -> VersionRow:
+        """What is tested in place of a version."""
+        search, league = self._champions_search(), self._league
+        if search is None:
+            return version
+        try:
+            searching = publish_search(
+                self._registry, version, league.config.environment, league.interface, search.rule, search.simulations
+            )
+        except InvalidInput:  # it has no value graph, or searches itself
+            return version
+        return version if searching.retired_at is not None else searching
+
+    def _number_without_search(self, version: VersionRow) -> int | None:
+        """The version that this one plays with a search like that of the champion; None for others."""
+        search, champions = version.search, self._champions_search()
+        if search is None or champions is None or not _are_alike(search, champions):
+            return None
+        return search.version
+
+    def _includes(self, nightly_run: NightlyRunRow, version: VersionRow) -> bool:
+        return not {version.number, self._number_without_search(version)}.isdisjoint(nightly_run.candidates)
 
     def _conclude(self, verdict: VerdictRow) -> None:
         with self._faults_of(f"{verdict.league}@{verdict.candidate} against {verdict.champion}"):
@@ -291,3 +339,8 @@ class _NightlyRun:
         except CONTESTANT_FAULTS as error:
             if str(error) not in self.faults:  # that all its files are missing
                 self.faults.append(f"{who}: {error}")
+
+
+def _are_alike(first: SearchSettings, second: SearchSettings) -> bool:
+    """Whether two searches differ only in the version that they search with."""
+    return (first.rule, first.simulations) == (second.rule, second.simulations)

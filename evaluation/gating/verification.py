@@ -21,6 +21,7 @@ from evaluation.gating.evidence import evidence, gate_result
 from evaluation.playback.replay import replay
 from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch, InvalidInput, LedgerConflict, VerdictRefuted
+from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry
 from league.registry.storage.rows import LeagueRow, VerdictRow
 from league.registry.verdicts import VOID
@@ -90,7 +91,14 @@ def verify(verdict: str, *, registry: Registry, replays: int = 0) -> Verificatio
     if wrong:
         raise VerdictRefuted(f"the record of verdict {row.short_id} contradicts its games: {'; '.join(wrong)}")
     replayed = _replay(registry, row, matches, replays)
-    conditions = Ledger(registry).schedule(row.schedule).conditions
+    ledger = Ledger(registry)
+    for schedule in map(ledger.schedule, row.tested_schedules):
+        if differences := ledger.recount(schedule, mend=False):
+            raise VerdictRefuted(
+                f"the sums of schedule {schedule.id} contradict its games: {', '.join(differences)}; "
+                f"`league recount {row.league}` replaces them"
+            )
+    conditions = ledger.schedule(row.schedule).conditions
     is_current = conditions == registry.leagues.get(row.league).conditions
     return Verification(
         row.id, row.outcome, len(matches), len(computed), replayed, is_current, recomputed.reason, recomputed.remedy
@@ -129,7 +137,11 @@ def _replay(registry: Registry, row: VerdictRow, matches: Sequence[Match], repla
     if not count:
         return 0
     league = registry.leagues.get(row.league)
-    with closing(stock_stepping(league.config.environment, 1)) as environment:
+    external = league.config.environment.external
+    if external is not None and not external.deterministic:
+        return 0  # the simulator's word is all there is
+    simulators = ForSimulators(registry.storage, row.league)
+    with closing(stock_stepping(league.config.environment, 1, simulators=simulators)) as environment:
         for number in np.linspace(0, len(games) - 1, count).astype(int):
             match, index = games[number]
             try:

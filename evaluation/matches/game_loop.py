@@ -15,20 +15,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.acting_versions import NO_MIXTURES, ActingVersions, acting_versions
 from evaluation.matches.game_state import ActionNumbers, AgentGenerators, AgentStates, action_keys
 from evaluation.matches.match_recorder import MatchRecorder
 from evaluation.matches.openings import OpeningMoves
 from evaluation.matches.policy_calls import Randomness, call_policy
-from evaluation.matches.returns import agent_sides
-from evaluation.matches.seating import Roster, Seating
+from evaluation.matches.seating import NO_MIXTURES, ActingVersions, Roster, Seating, acting_versions, agent_sides
 from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
 from evaluation.schedules.builders import GamePlans, game_plans
-from league.environments.stepping import Batch, BatchedEnvironment, Indices, Starts
+from league.environments.stepping import Batch, BatchedEnvironment, Indices, Starts, Turn
 from league.errors import EnvironmentMismatch, GameCrashed, GameHung, LeagueError, one_line
 from league.interface import Interface
 from league.policies.policy import Policy
-from league.registry.storage.mixture import Mixture
+from league.registry.storage.manifest import Mixture
 from league.results.records import Match, Reason, Schedule
 from league.spaces import DictSpace, Leaf, Space
 
@@ -119,25 +117,31 @@ class _GameLoop:
         self._generators = AgentGenerators(*shape)
         self._states: dict[int, AgentStates] = {}
         self._faulty: set[int] = set()
+        # Of each environment: whether its simulator lost its game, which is repeated; whether its next game was chosen.
+        self._is_lost, self._is_next_chosen = np.zeros(num_envs, bool), np.zeros(num_envs, bool)
         self._logged: set[tuple[str, Reason]] = set()
 
     def run(self) -> None:
         turn = self._environment.start(self._next_episodes)
-        self._begin(np.arange(len(self._running)))
-        while turn.batches:
+        self._begin()
+        while turn.batches or len(turn.crashed):
             actions = {group: self._act(group, batch) for group, batch in turn.batches.items()}
-            forfeited = self._forfeited()
+            forfeited = np.array(sorted(self._faulty), dtype=np.int64)
             if len(forfeited):
+                self._faulty.clear()
+                self._end(forfeited)
+                self._running[forfeited] = NO_GAME
                 self._environment.abandon(forfeited)
                 kept = {group: batch.without(forfeited) for group, batch in turn.batches.items()}
                 actions = {group: actions[group][rows] for group, rows in kept.items() if len(rows)}
-            self._end_step()
+            self._end_step(turn)
             turn = self._environment.step(actions)
             for rows in turn.endings:
                 self._returns[rows.envs, rows.agents] += rows.rewards
             if len(turn.finished):
                 self._end(turn.finished[~self._in_opening(turn.finished)])
-            self._begin(np.concatenate([forfeited, turn.finished]))
+            self._begin()
+            self._is_lost[turn.crashed] = True
 
     def check_deadline(self) -> None:
         """Raise GameTimeout if an environment has worked on its current game for too long."""
@@ -146,43 +150,41 @@ class _GameLoop:
             raise GameTimeout(self._hung(slow))
 
     def _next_episodes(self, envs: Indices) -> Starts:
-        games, attempts = self._next_games(envs)
-        starting = np.flatnonzero(games != NO_GAME)
-        games, attempts = games[starting], attempts[starting]
-        episodes = len(self._games) + np.arange(len(starting))
-        self._games, self._attempts = np.append(self._games, games), np.append(self._attempts, attempts)
-        self._begun[envs] = NO_GAME
-        self._begun[envs[starting]] = episodes
-        seating = self._seating
-        groups = np.tile(seating.in_opening, (len(games), 1)) if self._plies else seating.after_opening[games]
-        return Starts(envs[starting], self._plans.seeds[games], groups)
-
-    def _next_games(self, envs: Indices) -> tuple[Indices, Indices]:
-        """The next game of each environment, or NO_GAME, and the number of earlier attempts at it."""
+        # The next game of each environment, or NO_GAME, and the number of earlier attempts at it.
         games, attempts = np.full(len(envs), NO_GAME), np.zeros(len(envs), np.int64)
-        again = np.flatnonzero((self._running[envs] != NO_GAME) & self._in_opening(envs))
+        again = np.flatnonzero((self._running[envs] != NO_GAME) & (self._in_opening(envs) | self._is_lost[envs]))
         ended = self._running[envs[again]]
-        games[again], attempts[again] = self._games[ended], self._attempts[ended] + 1
+        games[again], attempts[again] = self._games[ended], self._attempts[ended] + ~self._is_lost[envs[again]]
         if attempts.max(initial=0) == MAX_OPENINGS:
             raise EnvironmentMismatch(
                 f"play.opening_plies: {MAX_OPENINGS} openings of {self._plies} random steps all ended the game;"
                 " fewer are needed"
             )
-        if len(again):
+        if len(again) and self._plies:
             self._openings.restart(games[again], attempts[again])
         free = np.flatnonzero(games == NO_GAME)[: len(self._plans) - self._next_game]
         games[free] = self._next_game + np.arange(len(free))
         self._next_game += len(free)
-        return games, attempts
+        starting = np.flatnonzero(games != NO_GAME)
+        games, attempts = games[starting], attempts[starting]
+        episodes = len(self._games) + np.arange(len(starting))
+        self._games, self._attempts = np.append(self._games, games), np.append(self._attempts, attempts)
+        self._begun[envs], self._is_next_chosen[envs] = NO_GAME, True
+        self._begun[envs[starting]] = episodes
+        seating = self._seating
+        groups = np.tile(seating.in_opening, (len(games), 1)) if self._plies else seating.after_opening[games]
+        return Starts(envs[starting], self._plans.seeds[games], groups)
 
     def _in_opening(self, envs: Indices) -> NDArray[np.bool_]:
         """Whether games are in their openings. A game that ends there is replaced."""
         return (self._steps[envs] <= self._plies) & (self._plies > 0)
 
-    def _begin(self, envs: Indices) -> None:
-        """The episodes that these environments began last are their current ones now."""
+    def _begin(self) -> None:
+        """The episodes that environments began in this step are their current ones now."""
+        envs = np.flatnonzero(self._is_next_chosen)
         if not len(envs):
             return
+        self._is_next_chosen[envs] = self._is_lost[envs] = False
         self._running[envs] = self._begun[envs]
         self._steps[envs] = 0
         self._returns[envs] = 0.0
@@ -228,22 +230,13 @@ class _GameLoop:
     def _keys(self) -> NDArray[np.uint64]:
         return action_keys(self._plans.seeds, self._plans.indices, len(self._agents))
 
-    def _forfeited(self) -> Indices:
-        """Record games that end by forfeit and return their environments."""
-        envs = np.array(sorted(self._faulty), dtype=np.int64)
-        if len(envs):
-            self._faulty.clear()
-            self._end(envs)
-            self._running[envs] = NO_GAME
-        return envs
-
     def _end(self, envs: Indices) -> None:
         """Record the games in some environments."""
         episodes = self._running[envs]
         self.recorder.end(self._games[episodes], episodes, self._returns[envs], self._steps[envs])
 
-    def _end_step(self) -> None:
-        playing = np.flatnonzero(self._running != NO_GAME)
+    def _end_step(self, turn: Turn) -> None:
+        playing = np.flatnonzero((self._running != NO_GAME) & turn.acting(len(self._running)))
         self._steps[playing] += 1
         steps = self._steps[playing]
         if self._plies and len(opened := playing[steps == self._plies]):

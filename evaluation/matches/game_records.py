@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from hashlib import blake2b
 
 from evaluation.documents import Document, Forfeits
 from evaluation.statistics.sequential import score_of
-from league.results.records import Game, Match
+from league.results.records import Match
+from league.results.sums import Examples, Pair, game_digest
 
 
 def forfeits(matches: Iterable[Match], contestant: str) -> int:
@@ -56,20 +56,12 @@ def unique_games(matches: Iterable[Match], contestant: str | None = None) -> int
     """
     return len(
         {
-            identity(match, game)
+            game_digest(match, game)
             for match in matches
             for game in match.games
             if contestant is None or contestant in (match.contestants[number] for number in game.sides)
         }
     )
-
-
-def identity(match: Match, game: Game) -> bytes:
-    """Hash of a game (16 bytes, so that a million fit into memory). Equal games have equal hashes."""
-    returns = sorted(map(repr, game.returns))
-    return blake2b(
-        repr((sorted(match.contestants), game.opening, game.actions, returns)).encode(), digest_size=16
-    ).digest()
 
 
 MIN_UPSET = 0.4
@@ -95,51 +87,46 @@ class Upset(Document):
         return self.score - self.expected
 
 
-class UpsetFinder:
-    """Scans games one by one and keeps the greatest upsets of each pair of contestants, independent of the order."""
+def greatest_upsets(
+    ratings: Mapping[str, float], pairs: Iterable[Pair], examples: Callable[[Pair], Examples], most: int
+) -> list[Upset]:
+    """At most `most` upsets, greatest first. The greatest of each pair takes precedence over any pair's second.
 
-    def __init__(self, ratings: Mapping[str, float], most: int) -> None:
-        """ratings: reference → Elo. most: number of upsets to return."""
-        self._ratings, self._most = ratings, most
-        self._kept: defaultdict[tuple[str, ...], dict[bytes, Upset]] = defaultdict(dict)
-
-    def see(self, match: Match) -> None:
-        if any(ref not in self._ratings for ref in match.contestants):
-            return
-        kept = self._kept[tuple(sorted(match.contestants))]
-        for index, game in enumerate(match.games):
-            upset = _upset_of(match, index, game, self._ratings)
-            if upset is None or (len(kept) == self._most and _order(upset) >= max(map(_order, kept.values()))):
-                continue
-            key = identity(match, game)
-            # The first by name represents equal games.
-            kept[key] = min(upset, kept.get(key, upset), key=_order)
-            if len(kept) > self._most:
-                del kept[max(kept, key=lambda game_key: _order(kept[game_key]))]
-
-    def greatest(self) -> list[Upset]:
-        """At most `most` upsets, greatest first. The greatest of each pair takes precedence over any pair's second."""
-        ranked = [
-            (rank, upset)
-            for kept in self._kept.values()
-            for rank, upset in enumerate(sorted(kept.values(), key=_order))
-        ]
-        selection = sorted(ranked, key=lambda item: (item[0], _order(item[1])))[: self._most]
-        return sorted((upset for _, upset in selection), key=_order)
+    Args:
+        ratings: Reference → Elo. Contestants without a rating have no upsets.
+        pairs: Pairs that have met.
+        examples: Reads the examples of a pair's games.
+        most: Number of upsets, at most MOST_EXAMPLES.
+    """
+    # The greatest upset that is possible comes first, so that most pairs are not read.
+    rated = sorted(
+        (-1 + score_of(-abs(ratings[first] - ratings[second])), (first, second))
+        for first, second in pairs
+        if first in ratings and second in ratings
+    )
+    of_pairs: list[list[Upset]] = []
+    for greatest, pair in rated:
+        if sum(upsets[0].size > -greatest for upsets in of_pairs) >= most:
+            break
+        if upsets := _upsets_of(pair, examples(pair), ratings)[:most]:
+            of_pairs.append(upsets)
+    ranked = [(rank, upset) for upsets in of_pairs for rank, upset in enumerate(upsets)]
+    selection = sorted(ranked, key=lambda item: (item[0], _order(item[1])))[:most]
+    return sorted((upset for _, upset in selection), key=_order)
 
 
-def _upset_of(match: Match, index: int, game: Game, ratings: Mapping[str, float]) -> Upset | None:
-    """The upset from the view of the contestant that exceeded its expectation; None below MIN_UPSET."""
-    greatest = None
-    for contestant, score in enumerate(game.scores):
-        if score is None:
-            continue
-        better, other = match.contestants[contestant], match.contestants[1 - contestant]
+def _upsets_of(pair: Pair, examples: Examples, ratings: Mapping[str, float]) -> list[Upset]:
+    """Upsets of a pair, greatest first, without copies of a game."""
+    upsets: dict[int, Upset] = {}
+    for (contestant, twice_score), of_kind in examples.items():
+        better, other = pair[contestant], pair[1 - contestant]
         expected = score_of(ratings[better] - ratings[other])
-        upset = Upset(match.id, index, better, other, expected, score)
-        if upset.size > (greatest.size if greatest else MIN_UPSET):
-            greatest = upset
-    return greatest
+        if twice_score / 2 - expected <= MIN_UPSET:
+            continue
+        for match, game, digest in of_kind:
+            upset = Upset(match, game, better, other, expected, twice_score / 2)
+            upsets[digest] = min(upset, upsets.get(digest, upset), key=_order)
+    return sorted(upsets.values(), key=_order)
 
 
 def _order(upset: Upset) -> tuple[float, str, int]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from league.environments.stepping import Batch, Indices
 from league.policies.draws import UniformNumbers
 from league.random import pcg64, splitmix64
-from league.random.seed_sequence import generate_state
+from league.random.pcg64 import generate_state
 from league.random.seeds import generators, spawn_key
 
 State = dict[str, NDArray]

@@ -3,32 +3,37 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from fractions import Fraction
+from itertools import groupby
+from operator import itemgetter
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evaluation.documents import Payoff, RatedVersion, Standing, iso_timestamp
-from evaluation.matches.game_records import Upset, UpsetFinder, identity
+from evaluation.matches.game_records import Upset, greatest_upsets
 from evaluation.schedules.builders import ANCHOR
 from evaluation.statistics.bradley_terry import Rating, rate
-from evaluation.statistics.payoff import only_side, tabulate
+from evaluation.statistics.payoff import tabulate
 from league.conditions import Conditions
 from league.registry.registry import Registry
 from league.registry.storage.rows import AliasEvent, LeagueRow, VersionRow
 from league.results.ledger import Ledger
-from league.results.records import BlockResult, Game, Match
+from league.results.records import GAMES_PER_BLOCK, Schedule
 from league.results.scoring import scoring
+from league.results.sums import Exact, Examples, GameSums, Pair, PairSums, load_examples, merged, outcomes, whole
 
 
 def compute_leaderboard(registry: Registry, league: str) -> tuple[Standing, ...]:
     """All contestants under the league's current conditions, best first. Raises UnknownLeague."""
-    conditions = registry.leagues.get(league).conditions
-    unrated = registry.versions.exploiter_refs(league)
-    return rank_contestants(Ledger(registry).results(league, conditions), unrated=unrated)
+    ledger, conditions = Ledger(registry), registry.leagues.get(league).conditions
+    sums = ledger.sums(league, ledger.counted(league, conditions))
+    return rank_contestants(whole(sums), unrated=registry.versions.exploiter_refs(league))
 
 
-def rated_version(version: VersionRow, leaderboard: Sequence[Standing], events: Sequence[AliasEvent]) -> RatedVersion:
+def rated_version(version: VersionRow, standing: Standing | None, events: Sequence[AliasEvent]) -> RatedVersion:
     """A version with its rating and the times when it became champion. events: history of the champion alias."""
-    standing = next((row for row in leaderboard if row.ref == version.ref), None)
     return RatedVersion(
         ref=version.ref,
         number=version.number,
@@ -43,62 +48,51 @@ def rated_version(version: VersionRow, leaderboard: Sequence[Standing], events: 
 
 
 def by_side(
-    sides: Sequence[str], matches: Sequence[Match], unrated: Collection[str] = ()
+    sides: Sequence[str], sums: Mapping[Pair, PairSums], unrated: Collection[str] = ()
 ) -> dict[str, tuple[Standing, ...]]:
     """Leaderboard of each side, for leagues that compare contestants on the same side.
 
     unrated: as in `rank_contestants`.
     """
-    results: dict[str, list[BlockResult]] = {side: [] for side in sides}
-    for match in matches:
-        for number, side in enumerate(sides):
-            games = [_on_side(game, number) for game in match.games]
-            part = replace(match, games=tuple(game for game in games if game is not None))
-            if part.games:
-                results[side].append(part.result())
-    return {side: rank_contestants(side_results, unrated=unrated) for side, side_results in results.items()}
-
-
-def _on_side(game: Game, side: int) -> Game | None:
-    """The part of a game that concerns one side, if its contestant played no other side."""
-    contestant = game.sides[side]
-    if only_side(game, contestant) != side:
-        return None
-    scores, returns = (
-        tuple(v if c == contestant else None for c, v in enumerate(values)) for values in (game.scores, game.returns)
-    )
-    return replace(game, scores=scores, returns=returns)
+    return {
+        side: rank_contestants(
+            {pair: of_pair.sides[number] for pair, of_pair in sums.items() if number in of_pair.sides}, unrated=unrated
+        )
+        for number, side in enumerate(sides)
+    }
 
 
 def rank_contestants(
-    results: Iterable[BlockResult],
+    sums: Mapping[Pair, GameSums],
     unique_games: Mapping[str, int] | None = None,
     unrated: Collection[str] = (),
 ) -> tuple[Standing, ...]:
-    """Sum up and rate `results`, best rating first. Contestants without a rating follow, by score.
+    """Sum up and rate results, best rating first. Contestants without a rating follow, by score.
 
     unrated: contestants whose games do not count in ratings: exploiters, which are strong against one version only.
     """
-    results = list(results)
-    games: Counter[str] = Counter()
-    whole: Counter[str] = Counter()
+    games: defaultdict[str, int] = defaultdict(int)
+    complete: defaultdict[str, int] = defaultdict(int)
     points: defaultdict[str, float] = defaultdict(float)
-    returns: defaultdict[str, float] = defaultdict(float)
-    for block in results:
-        for ref, score in zip(block.contestants, block.scores, strict=True):
-            games[ref] += block.games
+    returns: defaultdict[str, Exact] = defaultdict(int)
+    for pair, of_pair in sums.items():
+        number = of_pair.played
+        for ref, score, value in zip(pair, of_pair.points, of_pair.returns, strict=True):
+            games[ref] += number
             points[ref] += score
-        for ref, value in zip(block.contestants, block.returns or (), strict=block.returns is not None):
-            whole[ref] += block.games
+            complete[ref] += of_pair.games
             returns[ref] += value
-    ratings = rate([block for block in results if not any(ref in unrated for ref in block.contestants)], ANCHOR)
+    rated = {pair: of_pair for pair, of_pair in sums.items() if not any(ref in unrated for ref in pair)}
+    ratings = rate(outcomes(rated), ANCHOR)
     table = []
     for ref, played in games.items():
+        if not played:
+            continue
         rating = ratings.get(ref, Rating(None, None, None))
         table.append(
             Standing(
                 ref=ref,
-                mean_return=returns[ref] / whole[ref] if whole[ref] else None,
+                mean_return=float(Fraction(returns[ref]) / complete[ref]) if complete[ref] else None,
                 score=points[ref] / played,
                 games=played,
                 unique_games=None if unique_games is None else unique_games[ref],
@@ -117,65 +111,86 @@ MAX_UPSETS = 5
 
 
 class CountedGames:
-    """The games of a league that count, read from the ledger in small portions to limit memory.
+    """The games of a league that count, from the sums of the ledger.
 
-    leaderboard: contestants, best first, with unique games. matches: without moves; those between contestants of the
-    payoff matrix, or all if sides are rated.
+    leaderboard: contestants, best first, with unique games. sums: by pair of contestants.
     """
 
     def __init__(self, registry: Registry, league: LeagueRow, conditions: Conditions | None = None) -> None:
         """conditions: of the games, by default those of the league now."""
-        conditions = conditions or league.conditions
         self._sides = tuple(league.interface.sides)
         self._is_rated_by_side = scoring(league.config, league.interface) == "side" and len(self._sides) > 1
-        ledger = Ledger(registry)
-        purged = ledger.purged(league.slug)
-        schedules = {
-            schedule.id: schedule
-            for schedule in ledger.schedules(league.slug)
-            if schedule.id not in purged and (schedule.conditions, schedule.sides) == (conditions, self._sides)
-        }
+        self._league, self._ledger = league.slug, Ledger(registry)
+        self._schedules = [
+            schedule
+            for schedule in self._ledger.counted(league.slug, conditions or league.conditions)
+            if schedule.sides == self._sides
+        ]
         self._unrated = registry.versions.exploiter_refs(league.slug)
-        results = (result for result in ledger.results(league.slug) if result.schedule in schedules)
-        leaderboard = rank_contestants(results, unrated=self._unrated)
-        self._best = [standing.ref for standing in leaderboard[:MOST_CONTESTANTS]]
-        ratings = {standing.ref: standing.rating for standing in leaderboard if standing.rating is not None}
-        self._upsets = UpsetFinder(ratings, MAX_UPSETS)
-        self.games = 0
-        self.blocks = 0
-        self.matches: list[Match] = []
-        self._seen: set[bytes] = set()
-        self._distinct: Counter[str] = Counter()
-        for schedule in schedules.values():
-            for match in ledger.walk(schedule):
-                self._add(match)
-        self.unique_games = len(self._seen)
-        self.leaderboard = tuple(
-            replace(standing, unique_games=self._distinct[standing.ref]) for standing in leaderboard
-        )
+        self.sums = self._ledger.sums(league.slug, self._schedules)
+        self.matches = sum(of_pair.matches for of_pair in self.sums.values())
+        self.unique_games, by_contestant = _unique_games(self._ledger, self._league, self._sides, self._schedules)
+        self.leaderboard = rank_contestants(whole(self.sums), by_contestant, self._unrated)
+
+    @property
+    def games(self) -> int:
+        """Number of games."""
+        return GAMES_PER_BLOCK * self.matches
 
     def payoff(self) -> Payoff | None:
         """Payoff matrix of the best contestants; None before their first game."""
-        best = set(self._best)
-        between = [match for match in self.matches if set(match.contestants) <= best]
-        return tabulate(self._best, self._sides, between) if between else None
+        best = [standing.ref for standing in self.leaderboard[:MOST_CONTESTANTS]]
+        between = {pair: of_pair for pair, of_pair in self.sums.items() if set(pair) <= set(best)}
+        return tabulate(best, self._sides, between) if between else None
 
     def by_side(self) -> dict[str, tuple[Standing, ...]]:
         """Leaderboard of each side. Empty if sides are alike or there is only one."""
-        return by_side(self._sides, self.matches, self._unrated) if self._is_rated_by_side and self.matches else {}
+        return by_side(self._sides, self.sums, self._unrated) if self._is_rated_by_side and self.sums else {}
 
-    def greatest_upsets(self) -> list[Upset]:
+    def upsets(self) -> list[Upset]:
         """At most MAX_UPSETS of the least expected games, greatest upset first."""
-        return self._upsets.greatest()
+        ratings = {standing.ref: standing.rating for standing in self.leaderboard if standing.rating is not None}
+        texts = self._ledger.examples(self._league, self._schedules)
 
-    def _add(self, match: Match) -> None:
-        self._upsets.see(match)
-        self.blocks += 1
-        self.games += len(match.games)
-        for game in match.games:
-            if (key := identity(match, game)) not in self._seen:
-                self._seen.add(key)
-                self._distinct.update({match.contestants[number] for number in game.sides})
-        if self._is_rated_by_side or all(ref in self._best for ref in match.contestants):
-            games = tuple(replace(game, opening=(), actions=()) for game in match.games)
-            self.matches.append(replace(match, games=games))
+        def examples(pair: Pair) -> Examples:
+            return merged([load_examples(text, schedule) for schedule, text in texts[pair]])
+
+        return greatest_upsets(ratings, self.sums, examples, MAX_UPSETS)
+
+
+def _unique_games(
+    ledger: Ledger, league: str, sides: Sequence[str], schedules: Sequence[Schedule]
+) -> tuple[int, Counter[str]]:
+    """Number of games without copies, of all and of each contestant. sides: those of the schedules."""
+    plans = {plan.id: plan for plan in schedules}
+    # By players, because copies of a game have the same: many short arrays are sorted sooner than a long one.
+    digests: defaultdict[frozenset[str], list[NDArray[np.uint64]]] = defaultdict(list)
+    for name, stripes in groupby(ledger.digests(league), key=itemgetter(0)):
+        if name not in plans:
+            continue
+        games = _by_pairing(list(stripes), len(plans[name].pairings))
+        for number, pairing in enumerate(plans[name].pairings):
+            players = [plans[name].contestants[index] for index in pairing]
+            if len(sides) == 1:  # each contestant plays a game alone
+                for game, ref in enumerate(players):
+                    digests[frozenset([ref])].append(games[:, number, game])
+            else:
+                digests[frozenset(players)].append(games[:, number].ravel())
+    of_contestants: Counter[str] = Counter()
+    total = 0
+    for refs, parts in digests.items():
+        ordered = np.sort(np.concatenate(parts))
+        number = int(np.count_nonzero(ordered[1:] != ordered[:-1])) + int(ordered[0] != 0)
+        total += number
+        of_contestants.update(dict.fromkeys(refs, number))
+    return total, of_contestants
+
+
+def _by_pairing(stripes: Sequence[tuple[str, int, bytes]], pairings: int) -> NDArray[np.uint64]:
+    """Digests (rounds, pairings, GAMES_PER_BLOCK) of a schedule's games, 0 where there is no match."""
+    parts = [(start, np.frombuffer(data, "<u8").reshape(-1, GAMES_PER_BLOCK)) for _, start, data in stripes]
+    rounds = -(-max(start + len(part) for start, part in parts) // pairings)
+    games = np.zeros((rounds * pairings, GAMES_PER_BLOCK), np.uint64)
+    for start, part in parts:
+        games[start : start + len(part)] = part
+    return games.reshape(rounds, pairings, GAMES_PER_BLOCK)

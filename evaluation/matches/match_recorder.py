@@ -1,20 +1,57 @@
-"""Records games while they are played, and turns them into Match records."""
+"""Records games while they are played, their actions in columns, and turns them into Match records."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.matches.action_log import ActionLog
 from evaluation.matches.policy_calls import PolicyFault
-from evaluation.matches.returns import returns_of_games
+from evaluation.matches.seating import returns_of_games
 from evaluation.schedules.builders import GamePlans
 from league.environments.stepping import Indices
 from league.results.records import GAMES_PER_BLOCK, Forfeit, Game, Match, Members, Schedule
 from league.results.scoring import scores
+
+Actions = tuple[Any, ...]
+
+
+class ActionLog:
+    """Collects actions of many episodes step by step, and returns those of each episode."""
+
+    def __init__(self) -> None:
+        self._places: list[tuple[Indices, Indices, Indices]] = []
+        self._actions: list[Any] = []
+
+    def add(self, episodes: Indices, steps: Indices, agents: Indices, actions: NDArray) -> None:
+        """Add one action each of k agents. steps: of the episodes, from 0."""
+        self._places.append((episodes, steps, agents))
+        self._actions += actions.tolist()
+
+    def of(self, episodes: Indices, steps: Indices, opening: int) -> list[tuple[Actions, Actions]]:
+        """Return the actions of m episodes: those of the first `opening` steps, and the others.
+
+        They are ordered by step, then by agent. steps: how many steps of each episode count, (m,).
+        """
+        if not self._places:
+            return [((), ())] * len(episodes)
+        owners, at, agents = (np.concatenate(column) for column in zip(*self._places, strict=True))
+        # An episode and a step in one number, which grows with both.
+        stride = int(at.max()) + 1
+        order = np.lexsort((agents, owners * stride + at))
+        places = (owners * stride + at)[order]
+        actions = [self._actions[i] for i in order.tolist()]
+        firsts, middles, ends = (
+            np.searchsorted(places, episodes * stride + np.minimum(step, stride)).tolist()
+            for step in (np.zeros_like(steps), np.minimum(steps, opening), steps)
+        )
+        return [
+            (tuple(actions[first:middle]), tuple(actions[middle:end]))
+            for first, middle, end in zip(firsts, middles, ends, strict=True)
+        ]
 
 
 class MatchRecorder:

@@ -19,6 +19,7 @@ from league.errors import IllegalMask, RemoteError, one_line, raised_at
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, MalformedAction, Policy
 from league.results.records import MAX_DETAIL, Reason
+from league.search.policies import SearchPolicy
 from league.spaces import ACTION_MASK, Box, Discrete, Leaf, MultiDiscrete
 
 Generators = Sequence[np.random.Generator]
@@ -97,7 +98,7 @@ def fault_of(error: Exception) -> PolicyFault:
 def _call_batch(policy: Policy, batch: Batch, space: Leaf, state: State | None, randomness: Randomness) -> PolicyOutput:
     """Call the policy and check the form of its output. Raises whatever the policy raises."""
     if isinstance(randomness, ActionNumbers):
-        assert isinstance(policy, OnnxPolicy), "scripts have generators"
+        assert isinstance(policy, OnnxPolicy | SearchPolicy), "scripts have generators"
         output = policy.act(batch.observations, state=state, explore=True, rng=randomness)
     else:
         output = policy.act(batch.observations, state=state, rng=randomness)

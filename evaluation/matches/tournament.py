@@ -60,6 +60,7 @@ from league.registry.storage.rows import LeagueRow
 from league.results.ledger import Ledger
 from league.results.records import GAMES_PER_BLOCK, Match, Schedule
 from league.results.scoring import scoring
+from league.results.sums import tally, whole
 from league.settings import Storage
 from league.stack import installed_with_this
 
@@ -134,13 +135,15 @@ def play_schedule(
     ledger = Ledger(registry)
     schedule = ledger.open(schedule)
     config = registry.leagues.get(schedule.league).config
+    if config.environment.external is not None:
+        workers = 0  # simulators play, and this process asks the contestants for actions
     matches = ledger.matches(league=schedule.league, schedule=schedule.id)
     end = schedule.length if until is None else min(until, schedule.length)
     chunks = chunks_of(end, len(matches), num_envs(config))
     document = config.model_dump_json(by_alias=True)
     places = _Places(workers)
     played = (
-        _here(schedule, chunks, registry.storage, document)
+        (match_worker(registry.storage, document).play(schedule, chunk) for chunk in chunks)
         if workers == 0 or not chunks
         else _in_ray(schedule, chunks, registry.storage, document, places)
     )
@@ -266,7 +269,8 @@ def _report(
     tournament = () if kind == "cross_play" else plan.contestants
     compared = "team" if kind == "cross_play" else scoring(row.config, row.interface)
     distinct = {ref: unique_games(matches, ref) for ref in tournament}
-    table = rank_contestants((match.result() for match in matches), distinct) if tournament else ()
+    sums = tally(matches)
+    table = rank_contestants(whole(sums), distinct) if tournament else ()
     order, sides = [standing.ref for standing in table], tuple(row.interface.sides)
     rated_by_side = compared == "side" and len(sides) > 1
     return EvaluationReport(
@@ -276,14 +280,14 @@ def _report(
         games=sum(len(match.games) for match in matches),
         unique_games=unique_games(matches),
         leaderboard=table,
-        payoff=tabulate(order, sides, matches if tournament else ()),
+        payoff=tabulate(order, sides, sums if tournament else {}),
         scoring=compared,
         actions=row.conditions.actions,
-        by_side=by_side(sides, matches) if rated_by_side else {},
+        by_side=by_side(sides, sums) if rated_by_side else {},
         kind=kind,
         stopped_by=stopped_by,
         # Pairs chosen by rating may meet only once or twice, too rarely to estimate payoffs.
-        population=population(order, matches) if kind == "round_robin" else None,
+        population=population(order, sums) if kind == "round_robin" else None,
         cross_play=None if tournament else cross_play_table(plan.contestants, matches),
         forfeits=forfeits_of_all(matches),
     )
@@ -311,11 +315,6 @@ def _describe(schedule: Schedule) -> str:
     if len(rivals) == 1:
         return f"{first} against {rivals[0]}"
     return f"{first} against {len(rivals)} others" if schedule.kind == "gauntlet" else f"{len(rivals) + 1} contestants"
-
-
-def _here(schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str) -> Generator[list[Match]]:
-    for chunk in chunks:
-        yield match_worker(storage, config).play(schedule, chunk)
 
 
 class _Places:

@@ -15,12 +15,14 @@ from league.environments.building import interface
 from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation, stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch
-from league.policies.loading import check_eligible, contestant
+from league.policies.loading import check_eligible
 from league.policies.policy import Policy
 from league.refs import CheckpointRef, parse_ref
+from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry
-from league.registry.storage.mixture import Mixture
+from league.registry.storage.manifest import Mixture
 from league.results.records import Match, Schedule
+from league.search.policies import contestant
 from league.settings import Storage
 
 MOST_CONTESTANTS = 64
@@ -72,15 +74,27 @@ class MatchWorker:
         seated = self.interface.apart() if schedule.scoring == "team" else self.interface
         settings = self.config.play
         deadline = Deadline(settings.game_seconds, expendable)
-        environment = self._environment or stepping(self.config.environment, num_envs(self.config))
-        # An interrupted environment is neither reused nor closed, because closing may hang.
+        environment = self._environment or stepping(
+            self.config.environment,
+            num_envs(self.config),
+            simulators=ForSimulators(self._registry.storage, self.config.league),
+        )
+        # An interrupted environment is neither reused nor closed, because closing may hang, except for a gateway.
         self._environment = None
-        matches = play_matches(schedule, positions, environment, seated, roster, settings.max_moves, deadline, mixtures)
-        self._environment = environment
+        try:
+            matches = play_matches(
+                schedule, positions, environment, seated, roster, settings.max_moves, deadline, mixtures
+            )
+            self._environment = environment
+        finally:
+            if self._environment is None and self.config.environment.external is not None:
+                environment.close()
         return matches
 
     def close(self) -> None:
-        """Close the connections to the registry."""
+        """Close the connections to the registry, and those of simulators."""
+        if self._environment is not None and self.config.environment.external is not None:
+            self._environment.close()
         self._registry.close()
 
     def _mixture(self, ref: str) -> Mixture | None:
@@ -100,7 +114,7 @@ class MatchWorker:
         """
         if ref not in self._contestants:
             check_eligible(ref, self._registry, self.config)
-            self._contestants[ref] = contestant(ref, self._registry, self.interface)
+            self._contestants[ref] = contestant(ref, self._registry, self.interface, self.config.environment)
         self._contestants.move_to_end(ref)
         if len(self._contestants) > MOST_CONTESTANTS:
             self._contestants.popitem(last=False)

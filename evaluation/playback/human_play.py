@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.matches.policy_calls import PolicyFault, action_fault, fault_of
-from evaluation.matches.returns import agent_sides, contestant_returns
+from evaluation.matches.seating import agent_sides, contestant_returns
 from evaluation.playback.action_names import action_names, direction_keys
 from evaluation.playback.environment_hooks import Declarations, EnvironmentHooks
 from evaluation.playback.recorded_steps import LARGEST, likely, step_of
-from evaluation.playback.single_game import GameStep, Move, play_game, policy_output
+from evaluation.playback.single_game import GameStep, Move, expected_return, play_game, policy_output
 from evaluation.playback.video import data_uri
 from league.conditions import ActionSelection, action_selection
 from league.config.league import LeagueConfig
@@ -37,6 +37,7 @@ from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.registry.registry import Registry
 from league.results.scoring import scores, scoring
+from league.search.policies import SearchPolicy
 from league.service_requests import (
     GameForfeit,
     HumanPlayRequest,
@@ -112,6 +113,7 @@ def human_play(
     config: LeagueConfig,
     interface: Interface,
     players: Mapping[str, Policy],
+    analyst: Policy | None,
     environment: BatchedEnvironment,
     hooks: EnvironmentHooks,
 ) -> PlayedGame:
@@ -121,7 +123,8 @@ def human_play(
         request: The request.
         config: Configuration of the league.
         interface: Interface of the league.
-        players: agent → the opponent's policy, for all agents including the person's, for action probabilities.
+        players: agent → the opponent's policy, for all agents; that of the person's is not used.
+        analyst: Evaluates the person's positions: a graph or a search. None for no evaluation.
         environment: The environment. It must not be used again after GameCrashed.
         hooks: What the environment renders. If it has views of agents, the picture shows what the person's agent sees.
 
@@ -133,7 +136,7 @@ def human_play(
         RemoteError: The server of a remote opponent cannot be reached or failed.
     """
     space = space_of(interface, request.agent)
-    person = _Person(request.actions, space, players[request.agent] if request.chances else None)
+    person = _Person(request.actions, space, analyst)
     steps, last, stop, picture = _play(
         environment, players, person, request, interface, hooks, action_selection(config, interface)
     )
@@ -154,6 +157,7 @@ def human_play(
         returns=last.returns,
         score=None if awaiting else _score(request.agent, last.returns, forfeit, config, interface),
         chances=likely(Move(request.agent, {}, None, awaiting.inputs), space) if awaiting else (),
+        value=awaiting.value if awaiting else None,
         forfeits=(GameForfeit(agent=forfeit.agent, ref=request.opponent, reason=forfeit.fault.reason),)
         if forfeit
         else (),
@@ -212,11 +216,13 @@ class _Stop(Exception):
 
 
 class _AwaitingPerson(_Stop):
-    """It is the person's turn. inputs: of the analyst's action distribution."""
+    """It is the person's turn. analysis: what the analyst would do."""
 
-    def __init__(self, legal: tuple[int, ...], inputs: NDArray | None) -> None:
+    def __init__(self, legal: tuple[int, ...], analysis: Actions | None) -> None:
         super().__init__("it is the person's turn")
-        self.legal, self.inputs = legal, inputs
+        inputs = None if analysis is None else analysis.dist_inputs
+        self.legal, self.inputs = legal, None if inputs is None else inputs[0]
+        self.value = None if analysis is None else expected_return(analysis)
 
 
 class _Forfeited(_Stop):
@@ -233,7 +239,7 @@ class _Person:
     def __init__(self, choices: Sequence[int], space: Discrete, analyst: Policy | None) -> None:
         self._choices, self._space = choices, space
         self.left = len(choices)
-        self._analyst = analyst if isinstance(analyst, OnnxPolicy) else None
+        self._analyst = analyst if isinstance(analyst, OnnxPolicy | SearchPolicy) else None
 
     def act(
         self,
@@ -243,11 +249,14 @@ class _Person:
         explore: bool = False,  # noqa: ARG002
         rng: Sequence[np.random.Generator] | None = None,
     ) -> Actions:
-        analysis = None if self._analyst is None else policy_output(self._analyst, observations, state, rng)
+        # A graph may have a memory of the earlier positions; a search has none, and is slow.
+        is_evaluated = isinstance(self._analyst, OnnxPolicy) or not self.left
+        analysis = None
+        if self._analyst is not None and is_evaluated:
+            analysis = policy_output(self._analyst, observations, state, rng)
         legal = self._legal(observations.get(ACTION_MASK))
         if not self.left:
-            inputs = analysis.dist_inputs if analysis else None
-            raise _AwaitingPerson(legal, None if inputs is None else inputs[0])
+            raise _AwaitingPerson(legal, analysis)
         number = len(self._choices) - self.left
         choice = self._choices[number]
         self.left -= 1

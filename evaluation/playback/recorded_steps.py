@@ -38,6 +38,7 @@ def step_of(
             ref=controllers[move.agent],
             action=move.action,
             chances=likely(move, interface.agents[move.agent].action),
+            value=move.value,
         )
         for move in step.moves
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evaluation.matches.returns import agent_sides, contestant_returns
+from evaluation.matches.seating import agent_sides, contestant_returns
 from evaluation.playback.single_game import GameStep, play_game, policy_output
 from league.config.league import LeagueConfig
 from league.environments import building
@@ -23,12 +23,15 @@ from league.errors import (
     ObservationError,
 )
 from league.interface import Interface
-from league.policies.loading import acting_ref, contestant, pinned
+from league.policies.loading import acting_ref, pinned
 from league.policies.policy import Actions, Arrays, Policy
 from league.refs import CheckpointRef, parse_ref
 from league.registry.registry import Registry
+from league.registry.storage.rows import LeagueRow
 from league.results.ledger import Ledger
 from league.results.records import Action, Game, Match
+from league.search.policies import contestant
+from league.service_requests import RecordingRequest
 from league.spaces import DictSpace, Space
 
 NO_PLAYERS: Mapping[str, Policy] = {}
@@ -41,17 +44,19 @@ def replay(
     match: Match,
     index: int,
     players: Mapping[str, Policy] = NO_PLAYERS,
+    includes: Callable[[int, bool], bool] | None = None,
 ) -> Iterator[GameStep]:
     """Replay game `index` of a match in environment 0 and yield its steps. A forfeited game ends at its forfeit.
 
     players: agent → the policy that played it, to compute action probabilities again. Agents without a policy and
-    opening moves have none.
+    opening moves have none. includes: number of an action, and whether it is the last → whether to compute them there;
+    by default everywhere.
     Raises EnvironmentMismatch if the environment differs from the recorded one or deviates from the record.
     """
     if match.environment_digest != config.environment.digest():
         raise EnvironmentMismatch(f"match {match.id} was not played in the current environment of {config.league}")
     game = match.games[index]
-    record = _Record(match.id, [*game.opening, *game.actions], len(game.opening))
+    record = _Record(match.id, [*game.opening, *game.actions], len(game.opening), includes)
     policies = {
         agent: _Recorded(record, spaces.action, players.get(agent)) for agent, spaces in interface.agents.items()
     }
@@ -99,15 +104,19 @@ def _check_forfeits(match: Match, index: int, step: GameStep, interface: Interfa
 class _Record:
     """The recorded actions in order, the first `opening` of which were random."""
 
-    def __init__(self, match: str, actions: Sequence[Action], opening: int) -> None:
-        self._match, self._actions = match, iter(actions)
-        self._chosen = len(actions) - opening
+    def __init__(
+        self, match: str, actions: Sequence[Action], opening: int, includes: Callable[[int, bool], bool] | None
+    ) -> None:
+        self._match, self._actions, self._includes = match, iter(actions), includes
+        self._opening, self._length = opening, len(actions)
         self.left = len(actions)
 
     @property
-    def is_chosen(self) -> bool:
-        """Whether a policy chose the next action."""
-        return self.left <= self._chosen
+    def is_evaluated(self) -> bool:
+        """Whether a policy chose the next action, and its probabilities are computed."""
+        number = self._length - self.left + 1
+        is_included = self._includes is None or self._includes(number, number == self._length)
+        return is_included and number > self._opening
 
     def take(self) -> Action:
         if not self.left:
@@ -132,7 +141,7 @@ class _Recorded:
         rng: Sequence[np.random.Generator] | None = None,
     ) -> Actions:
         output = None
-        if self._player is not None and self._record.is_chosen:
+        if self._player is not None and self._record.is_evaluated:
             output = policy_output(self._player, observations, state, rng)
         actions = np.array([self._record.take()], dtype=self._dtype)
         return Actions(actions) if output is None else replace(output, actions=actions)
@@ -169,7 +178,7 @@ def live_game(refs: Sequence[str], registry: Registry, side: str | None = None, 
     row = registry.leagues.get(versions[0].league)
     names = [acting_ref(pinned(ref, row.slug, registry), registry, f"game {seed}") for ref in refs]
     current = building.interface(row.config)  # may have changed since the league was registered
-    players = {ref: contestant(ref, registry, current) for ref in names}
+    players = {ref: contestant(ref, registry, current, row.config.environment) for ref in names}
     controllers = _controllers(names, row.interface, side)
     policies = {agent: players[ref][agent][1] for agent, ref in controllers.items()}
     return GameSource(
@@ -181,11 +190,14 @@ def live_game(refs: Sequence[str], registry: Registry, side: str | None = None, 
     )
 
 
-def recorded_game(match: str, game: int, registry: Registry, chances: bool = False) -> GameSource:
+def recorded_game(
+    match: str, game: int, registry: Registry, chances: bool = False, request: RecordingRequest | None = None
+) -> GameSource:
     """Game number `game` of a match in the ledger, replayed exactly.
 
     chances: compute action probabilities again with those versions that can still be loaded.
-    Raises NotFound, and InvalidReference if the match has no such game.
+    request: if it names a search version, this evaluates the positions in their place, in the requested steps.
+    Raises NotFound, InvalidReference if the match has no such game, and what loading the search version raises.
     """
     ledger = Ledger(registry)
     record = ledger.match(match)
@@ -196,25 +208,30 @@ def recorded_game(match: str, game: int, registry: Registry, chances: bool = Fal
     seats = zip(agents, agent_sides(agents, seated(row.interface, record.games[game])), strict=True)
     acting = record.acting(game)
     controllers = {agent: acting[record.games[game].sides[side]] for agent, side in seats}
-    players = _graphs(controllers, registry, row.interface) if chances else {}
+    includes = None
+    if request is not None and request.analysis is not None:
+        analyst = contestant(f"{row.slug}@{request.analysis}", registry, row.interface, row.config.environment)
+        players, includes = {agent: policy for agent, (_, policy) in analyst.items()}, request.includes
+    else:
+        players = _graphs(controllers, registry, row) if chances else {}
     return GameSource(
         title=f"{match} · game {game}",
         config=row.config,
         interface=row.interface,
         controllers=controllers,
-        play=lambda environment: replay(environment, row.config, row.interface, record, game, players),
+        play=lambda environment: replay(environment, row.config, row.interface, record, game, players, includes),
         opening=ledger.schedule(record.schedule).opening_plies,
         note=_forfeits(record, game),
     )
 
 
-def _graphs(controllers: Mapping[str, str], registry: Registry, interface: Interface) -> dict[str, Policy]:
+def _graphs(controllers: Mapping[str, str], registry: Registry, league: LeagueRow) -> dict[str, Policy]:
     """agent → policy, for agents controlled by versions that still exist."""
     contestants: dict[str, Mapping[str, tuple[str, Policy]]] = {}
     for ref in set(controllers.values()):
         if isinstance(parse_ref(ref), CheckpointRef):
             with suppress(LeagueError):
-                contestants[ref] = contestant(ref, registry, interface)
+                contestants[ref] = contestant(ref, registry, league.interface, league.config.environment)
     return {agent: contestants[ref][agent][1] for agent, ref in controllers.items() if ref in contestants}
 
 

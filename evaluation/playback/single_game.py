@@ -17,6 +17,7 @@ from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
 from league.random.seeds import generator
+from league.search.searched_actions import SearchedActions
 from league.spaces.arrays import nested
 
 
@@ -25,13 +26,14 @@ class Move:
     """Observation and action of an agent in one step.
 
     observation: ONNX input name → array. action: as JSON. dist_inputs: (d,) inputs of the action distribution; None
-    unless the policy is a graph.
+    unless the policy is a graph or searches. value: the return that the agent expects; None unless the policy searches.
     """
 
     agent: str
     observation: dict[str, NDArray]
     action: Any
     dist_inputs: NDArray | None = None
+    value: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +92,11 @@ def policy_output(
     return policy.act(observations, state=state, explore=explore, rng=rng)
 
 
+def expected_return(output: Actions) -> float | None:
+    """The return that the agent of a single row expects; None unless the policy searches."""
+    return float(output.values[0]) if isinstance(output, SearchedActions) else None
+
+
 def first_observation(config: LeagueConfig, interface: Interface, policy: str | None, seed: int = 0) -> Any:
     """First observation of `policy` (None: of whoever begins) in a new episode as nested lists, as in a request body.
 
@@ -121,8 +128,8 @@ class _AgentPolicy:
             raise GameCrashed(f"{self._agent} has no action{cause(fault)}") from fault
         self._state, inputs = output.state, output.dist_inputs
         observation = {name: array[0] for name, array in batch.observations.items()}
-        move = Move(self._agent, observation, output.actions[0].tolist(), None if inputs is None else inputs[0])
-        return output.actions, move
+        action, value = output.actions[0].tolist(), expected_return(output)
+        return output.actions, Move(self._agent, observation, action, None if inputs is None else inputs[0], value)
 
 
 def _acting(turn: Turn, agents: Sequence[str]) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from league.errors import InvalidInput
 from league.registry.registry import Registry
 from league.registry.storage.rows import RunRow
 from league.results.ledger import Ledger
+from league.results.sums import outcomes, whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,13 +121,12 @@ def _between(registry: Registry, first: ComparedRun, second: ComparedRun) -> Sco
         return None
     pair = first.versions[-1], second.versions[-1]
     conditions = registry.leagues.get(first.league).conditions
-    blocks = [
-        result
-        for result in Ledger(registry).results(first.league, conditions)
-        if sorted(result.contestants) == sorted(pair) and pair[0] != pair[1]
-    ]
-    if not blocks:
+    ledger = Ledger(registry)
+    sums = ledger.sums(first.league, ledger.counted(first.league, conditions), between=pair)
+    if not sums or pair[0] == pair[1]:
         return None
-    scores = [block.scores[block.contestants.index(pair[0])] / block.games for block in blocks]
+    blocks = list(outcomes(whole(sums)))
+    place = blocks[0].contestants.index(pair[0])
+    scores = [score for block in blocks for score in [block.scores[place] / block.games] * block.matches]
     mean, low, high = score_interval(scores)
-    return ScoreBetween(*pair, mean, (low, high), sum(block.games for block in blocks))
+    return ScoreBetween(*pair, mean, (low, high), sum(block.games * block.matches for block in blocks))

@@ -30,7 +30,7 @@ from evaluation.statistics.bradley_terry import rate
 from league.config.league import LeagueConfig
 from league.errors import InvalidInput
 from league.interface import Interface
-from league.results.records import GAMES_PER_BLOCK, BlockResult, Match, Schedule
+from league.results.records import GAMES_PER_BLOCK, Match, Outcome, Schedule
 
 Kind = Literal["round_robin", "gauntlet", "adaptive", "cross_play"]
 
@@ -158,7 +158,7 @@ class StoppingRule:
         self._began = time.monotonic()
         self._checks: Iterator[int] = plan.precision_checks() if budget.precision is not None else iter(())
         self._next_check = next(self._checks, None)
-        self._results: list[BlockResult] = []
+        self._results: list[Outcome] = []
         self._precise_at: int | None = None
 
     @property
@@ -186,13 +186,13 @@ class StoppingRule:
     def _is_precise(self, matches: Sequence[Match]) -> bool:
         """Perform the due checks of the ratings."""
         while self._precise_at is None and self._next_check is not None and self._next_check <= len(matches):
-            self._results += [match.result() for match in matches[len(self._results) : self._next_check]]
+            self._results += [match.result().outcome for match in matches[len(self._results) : self._next_check]]
             if self._is_within(self._results):
                 self._precise_at = self._next_check
             self._next_check = next(self._checks, None)
         return self._precise_at is not None
 
-    def _is_within(self, results: Sequence[BlockResult]) -> bool:
+    def _is_within(self, results: Sequence[Outcome]) -> bool:
         matches = Counter(ref for block in results for ref in block.contestants)
         if any(matches[ref] < LEAST for ref in self._plan.contestants):
             return False

@@ -92,24 +92,23 @@ def _report(
             return nightly(config, registry=registry, workers=tasks, listener=listener)
 
 
-class Heartbeat:
+class Heartbeat(threading.Thread):
     """Writes heartbeats and progress to the registry in a thread, and reads stop requests from it."""
 
     def __init__(self, registry: Registry, options: EvaluationJobOptions) -> None:
-        self._registry = registry
-        self._options = options
+        super().__init__(name="heartbeat", daemon=True)
+        self._registry, self._options = registry, options
         self._progress: dict[str, Any] | None = None
         self._stop_requested = False
         self._is_over = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._is_over.set()
-        self._thread.join()
+        self.join()
 
     def listen(self, event: Progress | VerdictReport) -> None:
         """Listener of the evaluation. Raises EvaluationStopped."""
@@ -123,7 +122,8 @@ class Heartbeat:
         options = self._options
         self._registry.evaluations.finish(options.evaluation, options.runner, state, progress=self._progress, **outcome)
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Write heartbeats until the context ends."""
         options = self._options
         while not self._is_over.wait(HEARTBEAT_INTERVAL):
             try:

@@ -46,30 +46,19 @@ class _Job:
     process: Subprocess
 
 
-class EvaluationSupervisor:
+class EvaluationSupervisor(threading.Thread):
     """Polls the registry in a thread and runs up to `at_once` evaluations with `workers` processes each.
 
     address: Ray cluster that jobs join, or None to start a local one if needed.
     """
 
     def __init__(self, registry: Registry, *, workers: int = 1, at_once: int = 1, address: str | None = None) -> None:
-        self._registry = registry
-        self._workers = workers
-        self._at_once = at_once
-        self._address = address
+        super().__init__(name="evaluation-supervisor", daemon=True)
+        self._registry, self._address = registry, address
+        self._workers, self._at_once = workers, at_once
         self._jobs: list[_Job] = []
         self._wake = threading.Event()
         self._is_closed = False
-        self._thread = threading.Thread(target=self._run, name="evaluation-supervisor", daemon=True)
-
-    def start(self) -> None:
-        """Start polling."""
-        self._thread.start()
-
-    @property
-    def is_running(self) -> bool:
-        """Whether the polling thread is alive."""
-        return self._thread.is_alive()
 
     def notify(self) -> None:
         """Check the queue now."""
@@ -79,13 +68,14 @@ class EvaluationSupervisor:
         """Kill all jobs. Another evaluation service resumes their evaluations."""
         self._is_closed = True
         self._wake.set()
-        self._thread.join()
+        self.join()
         for job in self._jobs:
             job.process.kill()
             with suppress(LeagueError):  # without the database, the missing heartbeat releases the evaluation
                 self._release(job)
 
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Poll until `close`."""
         while not self._is_closed:
             try:
                 self._check_jobs()

@@ -27,11 +27,11 @@ from evaluation.matches.worker import MatchWorker
 from evaluation.playback.environment_hooks import EnvironmentHooks, environment_hooks
 from evaluation.playback.human_play import human_play, playability
 from evaluation.playback.recorded_steps import recorded_steps
-from evaluation.playback.replay import recorded_game
+from evaluation.playback.replay import GameSource, recorded_game
 from evaluation.playback.video import write_video
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
-from league.errors import GameCrashed, GameHung, LeagueError, one_line
+from league.errors import EnvironmentMismatch, GameCrashed, GameHung, LeagueError, one_line
 from league.policies.loading import acting_ref
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
@@ -54,78 +54,71 @@ class GameWorker:
     def __init__(self, league: str, registry: Registry) -> None:
         self._league, self._registry = league, registry
         self._matches: MatchWorker | None = None
-        self._environment: BatchedEnvironment | None = None
-        self._hooks: EnvironmentHooks | None = None
+        self._stage: tuple[BatchedEnvironment, EnvironmentHooks] | None = None
 
     def respond(self, operation: GameOperation) -> GameResponse:
         """Perform an operation. Raises LeagueError. An environment in an undefined state is discarded."""
-        matches = self._ready()
+        matches, environment, hooks = self._ready()
         match operation:
             case PlayabilityRequest():
-                return _json(playability(matches.config, self._registry, matches.interface, self._shown))
+                return _json(playability(matches.config, self._registry, matches.interface, hooks))
             case VideoRequest():
-                return GameResponse("image/gif", self._video(operation))
+                source = recorded_game(operation.match, operation.game, self._registry, chances=True)
+                return GameResponse("image/gif", _video(source))
             case RecordingRequest():
-                return _json(self._recording(operation))
+                record = Ledger(self._registry).match(operation.match)
+                source = recorded_game(operation.match, operation.game, self._registry, chances=True, request=operation)
+                recording = recorded_steps(source, record, operation, environment, hooks.draws)
+                if recording.fault is not None:
+                    self.discard_environment()
+                return _json(recording)
             case HumanPlayRequest():
-                return _json(self._human_play(operation, matches))
+                opponent = acting_ref(operation.opponent, self._registry, f"game {operation.seed}")
+                policies = {agent: policy for agent, (_, policy) in matches.contestant(opponent).items()}
+                analyst = None
+                if operation.analysis is not None:
+                    players = matches.contestant(f"{self._league}@{operation.analysis}")
+                    analyst = players[operation.agent][1] if operation.agent in players else None
+                elif operation.chances:
+                    analyst = policies.get(operation.agent)
+                config, interface = matches.config, matches.interface
+                try:
+                    return _json(human_play(operation, config, interface, policies, analyst, environment, hooks))
+                except GameCrashed:
+                    self.discard_environment()
+                    raise
 
     def discard_environment(self) -> None:
         """Drop the environment without calling it again."""
-        self._environment = None
+        self._stage = None
 
-    def _ready(self) -> MatchWorker:
+    def _ready(self) -> tuple[MatchWorker, BatchedEnvironment, EnvironmentHooks]:
         """Load the current configuration of the league and create its environment."""
         config = self._registry.leagues.get(self._league).config
         try:
             if self._matches is None or self._matches.config != config:
-                self._matches, self._environment = MatchWorker(config, self._registry), None
-            if self._environment is None:
-                self._hooks = environment_hooks(config.environment)
-                render_mode = "rgb_array" if self._hooks.draws else None
-                self._environment = stock_stepping(config.environment, 1, render_mode=render_mode)
+                self._matches, self._stage = MatchWorker(config, self._registry), None
+            if self._stage is None:
+                hooks = environment_hooks(config.environment)
+                render_mode = "rgb_array" if hooks.draws else None
+                self._stage = stock_stepping(config.environment, 1, render_mode=render_mode), hooks
         except Exception as error:  # never a fault of the caller
+            if config.environment.external is not None and isinstance(error, EnvironmentMismatch):
+                raise  # it says that the game cannot be shown
             raise GameCrashed(f"the environment of {self._league} cannot be created: {one_line(error)}") from error
-        return self._matches
+        return self._matches, *self._stage
 
-    @property
-    def _open(self) -> BatchedEnvironment:
-        assert self._environment is not None, "_ready creates one"
-        return self._environment
 
-    @property
-    def _shown(self) -> EnvironmentHooks:
-        assert self._hooks is not None, "_ready reads them"
-        return self._hooks
-
-    def _recording(self, request: RecordingRequest) -> BaseModel:
-        source = recorded_game(request.match, request.game, self._registry, chances=True)
-        match = Ledger(self._registry).match(request.match)
-        recording = recorded_steps(source, match, request, self._open, self._shown.draws)
-        if recording.fault is not None:
-            self.discard_environment()
-        return recording
-
-    def _video(self, request: VideoRequest) -> bytes:
-        source = recorded_game(request.match, request.game, self._registry, chances=True)
-        with tempfile.TemporaryDirectory() as directory:
-            out = Path(directory) / "game.gif"
-            try:
-                write_video(source, out)
-            except LeagueError:
-                raise
-            except Exception as error:
-                raise GameCrashed(f"{source.title} cannot be rendered: {one_line(error, with_type=True)}") from error
-            return out.read_bytes()
-
-    def _human_play(self, request: HumanPlayRequest, matches: MatchWorker) -> BaseModel:
-        opponent = acting_ref(request.opponent, self._registry, f"game {request.seed}")
-        policies = {agent: policy for agent, (_, policy) in matches.contestant(opponent).items()}
+def _video(source: GameSource) -> bytes:
+    with tempfile.TemporaryDirectory() as directory:
+        out = Path(directory) / "game.gif"
         try:
-            return human_play(request, matches.config, matches.interface, policies, self._open, self._shown)
-        except GameCrashed:
-            self.discard_environment()
+            write_video(source, out)
+        except LeagueError:
             raise
+        except Exception as error:
+            raise GameCrashed(f"{source.title} cannot be rendered: {one_line(error, with_type=True)}") from error
+        return out.read_bytes()
 
 
 def _within(worker: GameWorker, request: GameRequest, seconds: float) -> GameResponse:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections import OrderedDict
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -28,6 +29,8 @@ MOST_WORKERS = 4
 """Leagues with a process. The least recently used idle process makes room for another league."""
 MOST_WAITING = 16
 """Unanswered requests of one league."""
+IDLE = 300.0
+"""Seconds after the last request until the games that were shown or played are considered over."""
 MOST_CACHED, CACHE_BYTES = 256, 64 * 2**20
 """Cached responses, and their total size in bytes."""
 
@@ -42,6 +45,12 @@ class GameWorkerPool:
         self._seconds, self._grace, self._most = seconds, grace, most
         self._workers: OrderedDict[str, _LeagueWorker] = OrderedDict()
         self._cache: OrderedDict[str, Future[GameResponse]] = OrderedDict()
+        self._used_until = time.monotonic()
+
+    @property
+    def is_in_use(self) -> bool:
+        """Whether the last request is less than IDLE seconds ago."""
+        return time.monotonic() < self._used_until
 
     async def submit(self, request: GameRequest, timeout: float) -> GameResponse:
         """Return the response if it arrives within `timeout` seconds. Otherwise its computation continues.
@@ -54,6 +63,7 @@ class GameWorkerPool:
             LeagueError: The error that the worker reported.
             OSError: No process can be started.
         """
+        self._used_until = time.monotonic() + IDLE
         line = request.model_dump_json()
         response = self._cache.get(line)
         if response is None or (response.done() and not request.is_cacheable):

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from scipy.special import ndtri, stdtrit
 
 from evaluation.documents import CrossPlay, Difference, Estimate, Payoff
 from league.results.records import Game, Match
+from league.results.sums import GameSums, Pair, PairSums, tally, whole
 
 Floats = NDArray[np.float64]
 
@@ -38,13 +40,24 @@ def paired_difference(matches: Iterable[Match], contestant: str, confidence: flo
     Returns:
         The difference in the environment's unit of returns, or None without complete matches.
     """
-    gaps = []
-    for match in matches:
-        index = match.contestants.index(contestant)
-        own_return, other_return = match.mean_return(index), match.mean_return(1 - index)
-        if own_return is not None and other_return is not None:
-            gaps.append(own_return - other_return)
-    return student_interval(gaps, confidence) if gaps else None
+    sums = next(iter(tally(matches).items()), None)
+    if sums is None:
+        return None
+    (first, _), of_pair = sums
+    return _difference(of_pair.whole, first == contestant, confidence)
+
+
+def _difference(sums: GameSums, of_first: bool, confidence: float = 0.95) -> Difference | None:
+    """Mean difference of the returns of two contestants. of_first: the first's minus the second's, or the opposite."""
+    number, gap = sums.complete, sums.gap if of_first else -sums.gap
+    if not number:
+        return None
+    mean = float(Fraction(gap) / number)
+    if number == 1:
+        return Difference(mean, None, None)
+    variance = (number * sums.squares - gap * gap) / Fraction(number * (number - 1))
+    half = float(stdtrit(number - 1, 0.5 + confidence / 2)) * math.sqrt(variance / number)
+    return Difference(mean, mean - half, mean + half)
 
 
 def score_interval(scores: Sequence[float], confidence: float = 0.95) -> tuple[float, float, float]:
@@ -104,7 +117,7 @@ def crossed_interval(values: Floats, confidence: float = 0.95) -> Difference:
 Row = tuple[float | None, ...]
 
 
-def tabulate(contestants: Sequence[str], sides: Sequence[str], matches: Iterable[Match]) -> Payoff:
+def tabulate(contestants: Sequence[str], sides: Sequence[str], sums: Mapping[Pair, PairSums]) -> Payoff:
     """Payoff matrix: mean scores, games and paired differences of each ordered pair of `contestants`.
 
     `score[i][j] + score[j][i] = 1` for pairs that met, and `difference[i][j].mean = -difference[j][i].mean`. A game
@@ -113,56 +126,36 @@ def tabulate(contestants: Sequence[str], sides: Sequence[str], matches: Iterable
     Args:
         contestants: References in the order of rows and columns.
         sides: Names of the sides.
-        matches: Matches between these contestants.
+        sums: Over the matches between these contestants.
     """
-    total, by_side = _PairTotals(contestants), {side: _PairTotals(contestants) for side in sides}
-    met: defaultdict[tuple[str, str], list[Match]] = defaultdict(list)
-    for match in matches:
-        for row in (0, 1):
-            pair = (match.contestants[row], match.contestants[1 - row])
-            met[pair].append(match)
-            for game in match.games:
-                score = game.scores[row]
-                if score is None:
-                    continue
-                total.add(pair, score)
-                if (side := only_side(game, row)) is not None:
-                    by_side[sides[side]].add(pair, score)
+    gaps: dict[Pair, Difference | None] = {}
+    for (first, second), of_pair in sums.items():
+        gap = gaps[first, second] = _difference(of_pair.whole, of_first=True)
+        gaps[second, first] = gap and gap.opposite
+    scores, games = _cells(contestants, whole(sums))
     return Payoff(
         tuple(contestants),
-        total.means(),
-        total.counts(),
-        {side: table.means() for side, table in by_side.items()},
-        tuple(tuple(paired_difference(met[row, column], row) for column in contestants) for row in contestants),
+        scores,
+        games,
+        {
+            side: _cells(contestants, {pair: of.sides[number] for pair, of in sums.items() if number in of.sides})[0]
+            for number, side in enumerate(sides)
+        },
+        tuple(tuple(gaps.get((row, column)) for column in contestants) for row in contestants),
     )
 
 
-def only_side(game: Game, contestant: int) -> int | None:
-    """The side that a contestant played in a game, or None if it played several or none."""
-    sides = [side for side, player in enumerate(game.sides) if player == contestant]
-    return sides[0] if len(sides) == 1 else None
-
-
-class _PairTotals:
-    def __init__(self, contestants: Sequence[str]) -> None:
-        self._index = {name: i for i, name in enumerate(contestants)}
-        shape = (len(contestants), len(contestants))
-        self._points: NDArray[np.float64] = np.zeros(shape)
-        self._games: NDArray[np.int64] = np.zeros(shape, dtype=np.int64)
-
-    def add(self, pair: tuple[str, str], points: float) -> None:
-        row, column = (self._index[name] for name in pair)
-        self._points[row, column] += points
-        self._games[row, column] += 1
-
-    def means(self) -> tuple[Row, ...]:
-        return tuple(
-            tuple(float(p / n) if n else None for p, n in zip(points, games, strict=True))
-            for points, games in zip(self._points, self._games, strict=True)
-        )
-
-    def counts(self) -> tuple[tuple[int, ...], ...]:
-        return tuple(tuple(int(n) for n in row) for row in self._games)
+def _cells(
+    contestants: Sequence[str], sums: Mapping[Pair, GameSums]
+) -> tuple[tuple[Row, ...], tuple[tuple[int, ...], ...]]:
+    """Mean scores and numbers of games of each ordered pair of contestants."""
+    cells: dict[Pair, tuple[float, int]] = {}
+    for (first, second), of_pair in sums.items():
+        if played := of_pair.played:
+            points = of_pair.points
+            cells[first, second], cells[second, first] = (points[0] / played, played), (points[1] / played, played)
+    rows = [[cells.get((row, column), (None, 0)) for column in contestants] for row in contestants]
+    return tuple(tuple(score for score, _ in row) for row in rows), tuple(tuple(n for _, n in row) for row in rows)
 
 
 def cross_play_table(contestants: Sequence[str], matches: Iterable[Match]) -> CrossPlay:

@@ -6,23 +6,23 @@ for ratings.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from evaluation.documents import Document, Estimate, Payoff, Population
 from evaluation.statistics.payoff import Floats
 from league.results.equilibria import alpha_rank, nash_averaging
-from league.results.records import Match
+from league.results.sums import Pair, PairSums, pair_of
 
 
-def population(contestants: Sequence[str], matches: Sequence[Match], resamples: int = 200) -> Population | None:
+def population(contestants: Sequence[str], sums: Mapping[Pair, PairSums], resamples: int = 200) -> Population | None:
     """α-Rank and Nash shares of `contestants`, in that order. None unless every pair has met."""
-    met = {frozenset(match.contestants) for match in matches}
-    if any(frozenset((a, b)) not in met for a in contestants for b in contestants if a != b):
+    if any(pair_of(pair) not in sums for pair in combinations(contestants, 2)):
         return None
-    tables = resampled_scores(contestants, matches, resamples)
+    tables = resampled_scores(contestants, sums, resamples)
     nash = np.stack([nash_averaging(2 * table - 1)[0] for table in tables])
     return Population(alpha_rank=_estimates(alpha_rank(tables)), nash=_estimates(nash))
 
@@ -54,12 +54,12 @@ class PopulationShare(Document):
     value: float
 
 
-def shares(payoff: Payoff, matches: Sequence[Match]) -> tuple[PopulationShare, ...]:
+def shares(payoff: Payoff, sums: Mapping[Pair, PairSums]) -> tuple[PopulationShare, ...]:
     """Shares in the order of the payoff matrix. Empty if fewer than three contestants have all met each other."""
     refs = without_holes(payoff)
     if len(refs) < MIN_CONTESTANTS:
         return ()
-    tables = resampled_scores(refs, matches, RESAMPLES)
+    tables = resampled_scores(refs, sums, RESAMPLES)
     ranked = alpha_rank(tables)
     averaged = [nash_averaging(2 * table - 1) for table in tables]
     nash = np.stack([share for share, _ in averaged])
@@ -88,13 +88,13 @@ def without_holes(payoff: Payoff) -> list[str]:
 
 
 def resampled_scores(
-    contestants: Sequence[str], matches: Iterable[Match], resamples: int = 200, seed: int = 0
+    contestants: Sequence[str], sums: Mapping[Pair, PairSums], resamples: int = 200, seed: int = 0
 ) -> Floats:
     """Mean scores under random Exp(1) weights of the matches.
 
     Args:
         contestants: References in the order of rows and columns.
-        matches: Matches between them.
+        sums: Over the matches between them; others are left out.
         resamples: Number of random weightings.
         seed: Seed of the weights.
 
@@ -104,25 +104,24 @@ def resampled_scores(
     Raises:
         ValueError: For two contestants that never met.
     """
-    number = {name: i for i, name in enumerate(contestants)}
-    blocks = [match for match in matches if set(match.contestants) <= number.keys()]
-    first, second = (np.array([number[match.contestants[i]] for match in blocks], dtype=np.intp) for i in (0, 1))
-    score = np.array([match.score(0) for match in blocks], dtype=np.float64)
-    rng, size = np.random.default_rng(seed), len(contestants)
+    number, size = {name: i for i, name in enumerate(contestants)}, len(contestants)
     tables = np.full((resamples + 1, size, size), 0.5)
-    for row in range(resamples + 1):
-        weight = rng.standard_exponential(len(blocks)) if row else np.ones(len(blocks))
-        points, total = np.zeros((size, size)), np.zeros((size, size))
-        np.add.at(points, (first, second), weight * score)
-        np.add.at(points, (second, first), weight * (1 - score))
-        for pair in ((first, second), (second, first)):
-            np.add.at(total, pair, weight)
-        np.fill_diagonal(points, 0.5)
-        np.fill_diagonal(total, 1.0)
-        if (total == 0).any():
-            one, other = (contestants[i] for i in np.argwhere(total == 0)[0])
-            raise ValueError(f"{one} and {other} never met")
-        tables[row] = points / total
+    pairs = sorted(pair for pair in sums if set(pair) <= number.keys() and pair[0] != pair[1])
+    met = np.eye(size, dtype=bool)
+    rng = np.random.default_rng(seed)
+    for pair in pairs:
+        i, j = (number[ref] for ref in pair)
+        score, matches = np.array(
+            sorted((points / (2 * games), k) for (games, points, _), k in sums[pair].whole.outcomes.items())
+        ).T
+        # Equal matches, each with an Exp(1) weight, together have a Gamma(k, 1) weight.
+        weight = np.concatenate([matches[None], rng.standard_gamma(matches, (resamples, len(matches)))])
+        tables[:, i, j] = (weight @ score) / weight.sum(axis=1)
+        tables[:, j, i] = 1 - tables[:, i, j]
+        met[[i, j], [j, i]] = True
+    if not met.all():
+        first, second = (contestants[i] for i in np.argwhere(~met)[0])
+        raise ValueError(f"{first} and {second} never met")
     return tables
 
 

@@ -7,19 +7,35 @@ from typing import Any, Self
 import yaml
 from pydantic import ValidationError, field_validator, model_validator
 
-from league.config.algorithms import AnyTraining, TrainingConfig
-from league.config.base import JSON, Part, UniqueKeyLoader
+from league.config.algorithms import IMPORTED, TrainingConfig
+from league.config.base import JSON, Part
 from league.config.environment import EnvironmentConfig
 from league.config.gate import GateConfig
 from league.config.play import PlayConfig
 from league.config.ppo import PPOConfig
 from league.config.sweep import SweepConfig
-from league.config.training import NightlyConfig
+from league.config.training import NightlyConfig, TrainingSettings
 from league.config.validation_errors import describe_validation_error, describe_yaml_error
 from league.entry_points import search_in
+from league.environment_code import environment_code
 from league.errors import ConfigError, InvalidReference
 from league.interface import digest
 from league.refs import check_slug
+
+
+class UniqueKeyLoader(yaml.SafeLoader):
+    """Loads YAML without a key that occurs twice in a mapping, of which PyYAML would keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return the mapping. Raises ConstructorError for a repeated key."""
+        earlier_keys = set[tuple[str, str]]()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in earlier_keys:
+                raise yaml.constructor.ConstructorError(
+                    problem=f"the key {key.value!r} occurs twice", problem_mark=key.start_mark
+                )
+            earlier_keys.add((key.tag, str(key.value)))
+        return super().construct_mapping(node, deep)
 
 
 class LeagueConfig(Part):
@@ -59,12 +75,27 @@ class LeagueConfig(Part):
 
     @field_validator("training")
     @classmethod
-    def _exploiters_can_be_trained(cls, value: AnyTraining) -> AnyTraining:
+    def _fits_the_algorithm(cls, value: TrainingConfig) -> TrainingConfig:
+        return typed(value)
+
+    @field_validator("training")
+    @classmethod
+    def _exploiters_can_be_trained(cls, value: TrainingConfig) -> TrainingConfig:
         try:
             type(value).model_validate(value.model_dump(by_alias=True) | value.exploiter)
         except ValidationError as error:
             raise ValueError(f"exploiter.{describe_validation_error(type(value), error)}") from error
         return value
+
+    @model_validator(mode="after")
+    def _simulators_have_no_arguments(self) -> Self:
+        training = self.training
+        in_python = [name for name in ("curriculum", "wrappers") if getattr(training, name)]
+        if self.environment.external is not None and in_python:
+            raise ValueError(f"training.{in_python[0]} is for games in Python: a simulator applies its own")
+        if self.environment.external is not None and training.runners not in ("auto", 0, 1):
+            raise ValueError(f"training.runners is {training.runners}: one process serves all simulators, expected 1")
+        return self
 
     @model_validator(mode="after")
     def _search_in_folder(self) -> Self:
@@ -121,6 +152,24 @@ class LeagueConfig(Part):
         """Return the SHA-256 of `game`."""
         return digest(self.game())
 
+    @property
+    def training_environment(self) -> EnvironmentConfig:
+        """The environment with the wrappers of training."""
+        wrappers = (*self.environment.wrappers, *self.training.wrappers)
+        return self.environment.model_copy(update={"wrappers": wrappers})
+
+    def stage_environment(self, stage: int, seed: int = 0) -> EnvironmentConfig:
+        """Return the environment of training in a stage of its curriculum, from 0; without one, there is one stage.
+
+        seed: of the episode, from which random arguments are drawn.
+        """
+        environment, stages = self.training_environment, self.training.curriculum
+        return environment.with_arguments(stages[stage].drawn(seed)) if stages else environment
+
+    def training_code(self) -> dict[str, str]:
+        """Return entry point → SHA-256 of its source files, of the user's code that `training` names."""
+        return {name: environment_code(name, self.folder).source for name in self.training.entry_points}
+
     def with_training(self, **settings: Any) -> Self:
         """Return the configuration with some training settings replaced. Raises ConfigError if it is invalid."""
         training = self.training.model_dump(by_alias=True) | settings
@@ -166,6 +215,19 @@ class LeagueConfig(Part):
             checkpoint_every=None,
             checkpoint_minutes=None,
         )
+
+
+def typed(settings: TrainingSettings) -> TrainingSettings:
+    """Return the settings as those of their algorithm, if this process has imported it.
+
+    Raises ValueError, which names the faults.
+    """
+    if (model := IMPORTED.get(settings.algorithm)) is None:
+        return settings
+    try:
+        return model.model_validate(settings.model_dump(by_alias=True, exclude_unset=True))
+    except ValidationError as error:
+        raise ValueError(f"{describe_validation_error(model, error)} ({settings.algorithm})") from error
 
 
 def _large_integers(value: Any, key: str = "") -> Iterator[str]:

@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from league.config.base import Part
+from league.config.base import JSON, EntryPoint, Part
 
 Channels = Literal["first", "last"]
 """The axis of the channels of images: (channels, height, width) or (height, width, channels)."""
@@ -26,6 +26,15 @@ class ConvolutionConfig(Part):
     filters: int = Field(ge=1)
     kernel: int = Field(default=3, ge=1)
     stride: int = Field(default=1, ge=1)
+
+
+class NetworkConfig(Part):
+    """A network of the user's code, in place of the convolutions and hidden layers."""
+
+    entry_point: EntryPoint
+    """A subclass of torch.nn.Module, or a function that returns one."""
+    kwargs: JSON = Field(default={})
+    """Its keyword arguments, after the observation space."""
 
 
 class RecurrenceConfig(Part):

@@ -2,7 +2,7 @@
 
 from typing import ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from league.config.base import Part
 from league.config.network import GatedRecurrenceConfig
@@ -60,6 +60,14 @@ class OffPolicyConfig(TrainingSettings):
     priorities: PrioritiesConfig | None = None
     """Prioritised replay; null for uniform sampling."""
 
+    @field_validator("learners", "batch_scale")
+    @classmethod
+    def _only_one(cls, value: int | str, info: ValidationInfo) -> int | str:
+        if value not in (1, "auto"):
+            ability = "supports several learners" if info.field_name == "learners" else "scales its batches"
+            raise ValueError(f"expected 1, since only ppo {ability}; got {value}")
+        return value
+
     @model_validator(mode="after")
     def _buffer_fits(self) -> Self:
         if self.learning_starts > self.replay_capacity:
@@ -109,7 +117,6 @@ class DistributionalConfig(Part):
 class DQNConfig(QLearningConfig):
     """Deep Q-learning with action masks (Mnih et al., 2015, Nature 518)."""
 
-    algorithm: Literal["dqn"]
     dueling: bool = True
     """Separate heads for state values and advantages (Wang et al., 2016, arXiv 1511.06581)."""
     noisy: bool = False
@@ -121,7 +128,6 @@ class DQNConfig(QLearningConfig):
 class QMIXConfig(QLearningConfig):
     """QMIX: agents' values mixed to a team value (Rashid et al., 2018, arXiv 1803.11485)."""
 
-    algorithm: Literal["qmix"]
     mixer: Literal["qmix", "vdn", "none"] = "qmix"
     """qmix: a monotonic network conditioned on the global state. vdn: the sum (Sunehag et al., 2017, arXiv 1706.05296).
     none: independent learning from each agent's own rewards."""
@@ -138,9 +144,10 @@ class MADDPGConfig(OffPolicyConfig):
     agents to actions.
     """
 
-    algorithm: Literal["maddpg"]
     supports_opponents: ClassVar[bool] = False
     """Critics need the observations and actions of all agents."""
+    replaced_by_network: ClassVar[tuple[str, ...]] = ()
+    """They are settings of the critics, too."""
     lr: float = Field(default=0.01, gt=0)
     gamma: float = Field(default=0.95, ge=0, le=1)
     grad_clip: float = Field(default=0.5, gt=0)

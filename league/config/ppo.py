@@ -10,6 +10,7 @@ from league.config.schedules import Scheduled, ScheduledPositive
 from league.config.training import TrainingSettings
 
 UNIFORM, PREVIOUS = "uniform", "previous"
+Critic = Literal["own", "central", "state"]
 
 
 class PolicySettings(Part):
@@ -61,13 +62,17 @@ class TeacherConfig(Part):
 class PPOConfig(TrainingSettings):
     """Proximal policy optimisation (Schulman et al., 2017, arXiv 1707.06347)."""
 
-    algorithm: Literal["ppo"] = "ppo"
+    algorithm: str = "ppo"
     lr: ScheduledPositive = 5e-4
     """Learning rate of Adam."""
     train_batch_size: int = Field(default=4096, ge=1)
     """Actions per update."""
     minibatch_size: int = Field(default=512, ge=1)
     """Actions per gradient step."""
+    lag: int = Field(default=1, ge=0, le=8)
+    """Age of the weights that sample, in updates: update k learns from actions of the weights after update k − 1 − lag,
+    or of the last checkpoint if it is later; at most 8. Sampling and learning overlap with 1; with 0, and with
+    `runners: 0`, they alternate."""
     epochs: int = Field(default=4, ge=1)
     """Passes over each train batch."""
     lambda_: float = Field(default=0.95, ge=0, le=1, alias="lambda")
@@ -78,6 +83,11 @@ class PPOConfig(TrainingSettings):
     """Coefficient of the entropy bonus."""
     value_loss: float = Field(default=0.5, ge=0)
     """Coefficient of the value loss."""
+    critic: Critic = "own"
+    """What the value function gets while learning. own: its agent's observation. central: also the latest observations
+    of all agents, as in MAPPO (Yu et al., 2022, arXiv 2103.01955). state: also the environment's `state()`."""
+    normalize_values: bool = False
+    """Learn values in units of the running mean and deviation of returns."""
     magnet: MagnetConfig | None = None
     """Pull towards a reference policy; null for none."""
     teacher: TeacherConfig | None = None

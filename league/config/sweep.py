@@ -23,8 +23,11 @@ class SweepConfig(Part):
     """Training setting → a list of values (grid search), or a distribution of Ray Tune with its arguments:
     `{choice: [..]}`, `{uniform: [low, high]}`, `{loguniform: [low, high]}`, `{randint: [low, high]}`, `{randn: [mean,
     deviation]}`, `{quniform: [low, high, step]}`, … Settings of one policy are `per_policy.<id>.<setting>`."""
+    search: Literal["random", "optuna"] = "random"
+    """What decides the settings of the trials. random: draws of the distributions for each combination of the lists.
+    optuna: Optuna's TPE, from the results of the trials before; a list is a choice."""
     samples: int = Field(default=1, ge=1)
-    """Samples of the random parameters for each combination of the lists."""
+    """Samples of the random parameters for each combination of the lists; with `optuna`, the number of trials."""
     concurrent: int = Field(default=1, ge=1)
     """Maximum number of concurrent trials, also limited by the CPUs."""
     metric: str = "auto"

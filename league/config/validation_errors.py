@@ -9,8 +9,9 @@ from typing import Annotated, Any, Union, get_args, get_origin
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from league.config.algorithms import ALGORITHMS
+from league.config.algorithms import MODELS
 from league.config.schedules import SCHEDULE_FORMS
+from league.config.training import TrainingSettings
 from league.errors import one_line
 
 SHOWN = 3
@@ -42,19 +43,28 @@ def describe_yaml_error(error: Exception) -> str:
 
 def describe_validation_error(model: type[BaseModel], error: ValidationError) -> str:
     """Return the first faults as a sentence that names the keys and the expected values, unknown keys first."""
-    faults = _without_consequences([Fault.of(model, detail) for detail in error.errors()])
+    faults = [Fault.of(model, detail) for detail in error.errors()]
+    # Without those of a collection with a faulty item, and keys that are missing because they are misspelt.
+    paths = [fault.path for fault in faults]
+    misspelt = {(*fault.path[:-1], fault.guess) for fault in faults if fault.guess is not None}
+    root_faults = [
+        fault
+        for fault in faults
+        if not (fault.kind == "missing" and fault.path in misspelt)
+        and not any(len(path) > len(fault.path) and path[: len(fault.path)] == fault.path for path in paths)
+    ]
     # A value that has none of several types is one fault.
     combined: dict[tuple[Any, ...], Fault] = {}
-    for fault in faults:
+    for fault in root_faults:
         other = combined.setdefault((fault.path, fault.message), fault)
         expected = tuple(dict.fromkeys((*other.expected, *fault.expected)))
         combined[fault.path, fault.message] = replace(fault, expected=expected)
     unknown_first = sorted(combined.values(), key=lambda fault: not fault.is_unknown_key)
     first = list({str(fault): fault for fault in unknown_first}.values())[:SHOWN]
     # Several keys of one mapping have the same list.
-    lists = [fault.known for fault in first]
+    lists = [fault.listed for fault in first]
     return "; ".join(
-        f"{fault}{'' if fault.known in lists[:number] else fault.known}" for number, fault in enumerate(first)
+        f"{fault}{'' if fault.listed in lists[:number] else fault.listed}" for number, fault in enumerate(first)
     )
 
 
@@ -62,7 +72,7 @@ def describe_validation_error(model: type[BaseModel], error: ValidationError) ->
 class Fault:
     """One of pydantic's errors.
 
-    path: keys and indices, without the names of union members; guess: a similar key; known: the list of known keys, if
+    path: keys and indices, without the names of union members; guess: a similar key; listed: the list of known keys, if
     none is similar; expected: the types that the value does not have.
     """
 
@@ -70,16 +80,16 @@ class Fault:
     kind: str
     message: str
     guess: str | None = None
-    known: str = ""
+    listed: str = ""
     expected: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, model: type[BaseModel], detail: Any) -> "Fault":
         """Read an error of `model`."""
         path, known_by, start = list(detail["loc"]), model, 0
-        if path[:1] == ["training"] and len(path) > 1 and path[1] in ALGORITHMS:
-            known_by, start = ALGORITHMS[path.pop(1)], 1
-        if known_by in ALGORITHMS.values():
+        if path[:1] == ["training"] and len(path) > 1 and path[1] in MODELS:
+            known_by, start = MODELS[path.pop(1)], 1
+        if issubclass(known_by, TrainingSettings):
             path = [part for part in path if part not in SCHEDULE_FORMS]
         kind = detail["type"]
         # Pydantic puts the member of a union that it tried into the path: `tuple[str, ...]`, or a basic type.
@@ -96,7 +106,7 @@ class Fault:
         if guesses := difflib.get_close_matches(str(path[-1]), known_keys, n=1):
             return cls(tuple(path), "extra_forbidden", f"unknown key, did you mean {guesses[0]!r}?", guesses[0])
         listed = f", expected one of {', '.join(sorted(known_keys))}" if known_keys else ""
-        return cls(tuple(path), "extra_forbidden", "unknown key", known=listed)
+        return cls(tuple(path), "extra_forbidden", "unknown key", listed=listed)
 
     @property
     def is_unknown_key(self) -> bool:
@@ -105,34 +115,19 @@ class Fault:
 
     def __str__(self) -> str:
         key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in self.path).removeprefix(".")
-        algorithm = ".algorithm" if self.kind == "union_tag_invalid" else ""
         expected = f"expected {' or '.join(self.expected)}, " if self.expected else ""
-        return f"{key or 'file'}{algorithm}: {expected}{self.message}"
+        return f"{key or 'file'}: {expected}{self.message}"
 
 
 def _message(detail: Any) -> str:
     match detail["type"]:
         case "missing":
             return "missing, but required"
-        case "union_tag_invalid":
-            return f"expected one of {', '.join(ALGORITHMS)}, got {detail['ctx']['tag']!r}"
         case "value_error":
             return str(detail["ctx"]["error"])
         case "json_invalid":  # the input is the whole file
             return f"not valid JSON: {detail['ctx']['error']}"
     return f"{detail['msg'][0].lower()}{detail['msg'][1:]}, got {detail['input']!r}"
-
-
-def _without_consequences(faults: list[Fault]) -> list[Fault]:
-    """Leave out faults of a collection with a faulty item, and keys that are missing because they are misspelt."""
-    paths = [fault.path for fault in faults]
-    misspelt = {(*fault.path[:-1], fault.guess) for fault in faults if fault.guess is not None}
-    return [
-        fault
-        for fault in faults
-        if not (fault.kind == "missing" and fault.path in misspelt)
-        and not any(len(path) > len(fault.path) and path[: len(fault.path)] == fault.path for path in paths)
-    ]
 
 
 def _known_keys(model: type[BaseModel], path: list[str | int]) -> list[str]:

@@ -25,9 +25,10 @@ from league.config.league import LeagueConfig
 from league.config.play import PlayConfig
 from league.entry_points import import_entry_point, import_module, missing
 from league.environments.apis import NAMES, RLlibEnv, api_of, with_api
+from league.environments.declared import declared
 from league.environments.info_masks import with_info_masks
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
-from league.environments.wrapping import wrapped
+from league.environments.wrappers.wrapping import wrapped
 from league.errors import ConfigError, EnvironmentMismatch, LeagueError, cause
 from league.interface import AgentInterface, Interface
 from league.refs import check_slug
@@ -84,8 +85,12 @@ AMENDMENTS = (with_drawing, with_whole_reset, with_reseeding, with_one_copy)
 def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
     """Build an environment: a PettingZoo AECEnv or ParallelEnv, or an `RLlibEnv`. Its agents are strings.
 
+    That of a game that runs in simulators has spaces only.
+
     Raises ConfigError if it cannot be imported, constructed or wrapped.
     """
+    if config.external is not None:
+        return declared(config.external)
     if render_mode != "human":
         # Lets environments draw without a display.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")

@@ -14,6 +14,7 @@ from league.environments.vector.vector_env import UnsupportedArguments, VectorEn
 from league.environments.vector_stepping import VectorStepping
 from league.environments.vector_wrapping import UnsupportedWrapper, wrapped_vector
 from league.errors import ConfigError
+from league.registry.gateways import ForSimulators
 from league.stack import VERIFIED, installed
 
 logger = logging.getLogger(__name__)
@@ -76,6 +77,9 @@ def implementation(config: EnvironmentConfig) -> Implementation:
 
 
 def _without_wrappers(config: EnvironmentConfig) -> Implementation:
+    if config.external is not None:
+        external = config.external
+        return Implementation(None, f"It runs in the simulator {external.simulator}, version {external.version}.")
     if config.vector is not None:
         return _if_supported(config.vector, config)
     verified = VECTORISED.get(config.entry_point)
@@ -103,7 +107,13 @@ def _if_verified(packages: Sequence[str]) -> Implementation | None:
 
 
 def stepping(
-    config: EnvironmentConfig, num_envs: int, *, crashes: int = 0, states: bool = False, fast_seeds: bool = False
+    config: EnvironmentConfig,
+    num_envs: int,
+    *,
+    crashes: int = 0,
+    states: bool = False,
+    fast_seeds: bool = False,
+    simulators: ForSimulators | None = None,
 ) -> BatchedEnvironment:
     """Create environments that are stepped together, vectorised if possible. See `stock_stepping`.
 
@@ -115,7 +125,7 @@ def stepping(
     logger.info("%s: %s", config.entry_point, choice.reason)
     vector = choice.vector
     if vector is None:
-        return stock_stepping(config, num_envs, crashes=crashes, states=states)
+        return stock_stepping(config, num_envs, crashes=crashes, states=states, simulators=simulators)
     make: Callable[[int], VectorEnv] = partial(vector, **config.kwargs)
     return VectorStepping(config, make, num_envs, crashes, states, fast_seeds)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from league.config.environment import EnvironmentConfig
 from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for, splitter
 from league.environments.building import agent_interface, build
+from league.environments.external.stepping import ExternalStepping
 from league.environments.stepping import (
     Batch,
     BatchedEnvironment,
@@ -30,6 +31,7 @@ from league.environments.stepping import (
 )
 from league.environments.vector.vector_env import AgentRows
 from league.errors import InvalidReturn, LeagueError, ObservationError
+from league.registry.gateways import ForSimulators
 from league.spaces import inputs
 from league.spaces.arrays import environment_actions
 
@@ -46,8 +48,10 @@ def stock_stepping(
     crashes: int = 0,
     render_mode: str | None = None,
     states: bool = False,
+    of_seed: Callable[[int], EnvironmentConfig] | None = None,
+    simulators: ForSimulators | None = None,
 ) -> BatchedEnvironment:
-    """Create copies of the stock environment that are stepped in lockstep.
+    """Create copies of the stock environment that are stepped in lockstep, or by the simulators in which it runs.
 
     Args:
         config: The environment.
@@ -55,8 +59,19 @@ def stock_stepping(
         crashes: Number of consecutive exceptions after which an environment is recreated; the next one is raised.
         render_mode: PettingZoo's render mode (`rgb_array`, `human`).
         states: Include global states in the results.
+        of_seed: The environment of the episode with a seed, with the spaces of `config`: each episode has its own.
+        simulators: For what simulators may play. None: somebody watches, for whom they cannot.
+
+    Raises ConfigError if the environment cannot be created, and EnvironmentMismatch if only simulators play the game.
     """
-    return Lockstep(lambda: build(config, render_mode), num_envs, crashes, states)
+    if config.external is not None:
+        env = build(config)
+        if simulators is None:
+            return env.reset()  # raises an error that says why
+        spaces = {agent: agent_interface(env, agent) for agent in env.possible_agents}
+        return ExternalStepping(config.external, spaces, num_envs, simulators)
+    make_of_seed = None if of_seed is None else lambda seed: build(of_seed(seed), render_mode)
+    return Lockstep(lambda: build(config, render_mode), num_envs, crashes, states, make_of_seed)
 
 
 class Lockstep(EpisodeStepping):
@@ -65,8 +80,16 @@ class Lockstep(EpisodeStepping):
     Episodes of an environment differ only by their seeds. PettingZoo requires `reset` to clear all other state.
     """
 
-    def __init__(self, make: Callable[[], Any], num_envs: int, crashes: int = 0, states: bool = False) -> None:
-        self._make, self._gives_states = make, states
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        num_envs: int,
+        crashes: int = 0,
+        states: bool = False,
+        make_of_seed: Callable[[int], Any] | None = None,
+    ) -> None:
+        """make_of_seed: makes the environment of each episode from its seed; by default all are alike."""
+        self._make, self._make_of_seed, self._gives_states = make, make_of_seed, states
         envs = [make() for _ in range(num_envs)]
         super().__init__(envs[0].possible_agents, num_envs, crashes)
         interfaces = [agent_interface(envs[0], agent) for agent in self.agents]
@@ -163,6 +186,9 @@ class Lockstep(EpisodeStepping):
     def _reset(self, env: int) -> list[Report]:
         while True:
             try:
+                if self._make_of_seed is not None:
+                    self._envs[env].close()
+                    self._envs[env] = adapter_for(self._make_of_seed(int(self._seeds[env])), self._splits)
                 reports = self._timed(env, self._envs[env].reset, int(self._seeds[env]))
                 break
             except InvalidReturn as error:

@@ -132,12 +132,20 @@ class Turn:
     """The last reports of agents, in one block for each observation space. Each row has one or both flags."""
     finished: Indices = field(default_factory=no_envs)
     crashed: Indices = field(default_factory=no_envs)
-    """Environments that raised an exception and were recreated. Their episodes have no endings and are not in
-    `finished`; earlier reports of them must be discarded. The next episodes have already started."""
+    """Environments that raised an exception and were recreated, or lost their simulators. Their episodes have no
+    endings and are not in `finished`; earlier reports of them must be discarded. The next episodes have already
+    started, or start with the next step if a simulator was lost."""
     states: States | None = None
     """The current global state of each environment with an episode, if requested and available."""
     last_states: States | None = None
     """The global states of finished environments at the end of their episodes."""
+
+    def acting(self, num_envs: int) -> NDArray[np.bool_]:
+        """Return which environments have agents that must act, (num_envs,)."""
+        acting = np.zeros(num_envs, bool)
+        for batch in self.batches.values():
+            acting[batch.envs] = True
+        return acting
 
     def each_ending(self) -> Iterator[Ending]:
         """Yield the rows of `endings`, for callers with few environments."""
@@ -164,9 +172,10 @@ class BatchedEnvironment(Protocol):
         no episode."""
 
     def step(self, actions: Mapping[int, NDArray]) -> Turn:
-        """Step all environments. actions[group][i] belongs to row i of the group's batch in the last Turn.
+        """Step the environments of the last Turn. actions[group][i] belongs to row i of the group's batch in it.
 
-        A Turn without batches means that all environments are idle. Raises IllegalAction before any environment is
+        Without simulators these are all environments with an episode. A Turn without batches and crashed environments
+        means that all environments are idle. Raises IllegalAction before any environment is
         stepped.
         """
 

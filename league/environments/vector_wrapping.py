@@ -12,9 +12,9 @@ from pettingzoo import ParallelEnv
 
 from league.config.environment import EnvironmentConfig, WrapperConfig
 from league.environments.building import build
-from league.environments.transforms import Transform, transform
 from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.environments.wrapping import AgentSpaces, agent_spaces, with_arguments
+from league.environments.wrappers.transforms import Transform, transform
+from league.environments.wrappers.wrapping import AgentSpaces, agent_spaces, with_arguments
 from league.spaces import OBSERVATION
 
 MakeVectorEnv = Callable[..., VectorEnv]
@@ -94,8 +94,7 @@ class WrappedVectorEnv(VectorEnv):
 
     def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
         """See VectorEnv."""
-        agents = len(self.possible_agents)
-        slots = (env_ids[:, np.newaxis] * agents + np.arange(agents)).ravel()
+        slots = self._slots(env_ids)
         for transforms in self._transforms.values():
             for observation_transform in transforms:
                 observation_transform.reset(slots)
@@ -107,6 +106,13 @@ class WrappedVectorEnv(VectorEnv):
             actions = change(actions)
         return self._wrapped(self._env.step(env_ids, actions))
 
+    def copy(self, source: NDArray[np.int64], target: NDArray[np.int64]) -> None:
+        """See VectorEnv."""
+        self._env.copy(source, target)
+        for transforms in self._transforms.values():
+            for observation_transform in transforms:
+                observation_transform.copy(self._slots(source), self._slots(target))
+
     def use_fast_seeds(self) -> None:
         """See VectorEnv."""
         self._env.use_fast_seeds()
@@ -114,6 +120,10 @@ class WrappedVectorEnv(VectorEnv):
     def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32] | None:
         """See VectorEnv. Wrappers do not change the state."""
         return self._env.state(env_ids)
+
+    def _slots(self, env_ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        agents = len(self.possible_agents)
+        return (env_ids[:, np.newaxis] * agents + np.arange(agents)).ravel()
 
     def _wrapped(self, blocks: Sequence[AgentRows]) -> Sequence[AgentRows]:
         """Change the rows, and join those of agents whose spaces have become equal."""

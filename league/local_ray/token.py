@@ -11,7 +11,8 @@ from typing import Any
 MODE, TOKEN, TOKEN_FILE = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
 """Ray's environment variables."""
 DISABLED = "disabled"
-_own: str | None = None
+_variables: dict[str, str] = {}
+"""What this process has set, and its values."""
 
 
 def create_token() -> None:
@@ -19,21 +20,22 @@ def create_token() -> None:
 
     It is in the environment, which only processes of the same user can read and the processes of this one inherit.
     """
-    global _own
-    os.environ.setdefault(MODE, "token")
+    if MODE not in os.environ:
+        os.environ[MODE] = _variables[MODE] = "token"
     if os.environ[MODE] == DISABLED or TOKEN_FILE in os.environ or TOKEN in os.environ:
         return
-    os.environ[TOKEN] = _own = secrets.token_hex(32)
+    os.environ[TOKEN] = _variables[TOKEN] = secrets.token_hex(32)
     _reload()
 
 
 def forget_token() -> None:
-    """Forget the token of a Ray that this process has started and stopped. A cluster has another one."""
-    global _own
-    if _own is not None and os.environ.get(TOKEN) == _own:
-        del os.environ[TOKEN]
+    """Forget the token of a Ray that this process has started and stopped. A cluster has another one, or none."""
+    for name, value in _variables.items():
+        if os.environ.get(name) == value:
+            del os.environ[name]
+    if _variables:
+        _variables.clear()
         _reload()
-    _own = None
 
 
 def _reload() -> None:

@@ -62,6 +62,34 @@ def to_environment(raw: NDArray, space: Space) -> NDArray:
     raise ConfigError(f"unsupported action space {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
 
 
+def from_environment(actions: NDArray, space: Space) -> NDArray:
+    """Convert actions of the environment to raw actions: the inverse of `to_environment`.
+
+    Args:
+        actions: (k, *shape), inside the space.
+        space: The action space.
+
+    Returns:
+        Raw actions, (k,) or (k, m). Those of a Box element with two finite bounds are from -1 to 1.
+
+    Raises:
+        ConfigError: The action space is not supported.
+    """
+    match space:
+        case Discrete(start=start):
+            return actions.astype(np.int64) - start
+        case MultiDiscrete(start=start):
+            return (actions.astype(np.int64) - np.asarray(start)).reshape(len(actions), -1)
+        case Box(dtype=dtype) if np.dtype(dtype).kind == "f":
+            low, high = bounds(space)
+            finite = np.isfinite(low) & np.isfinite(high) & (low < high)
+            wide, low, high = actions.astype(np.float64), np.where(finite, low, -1), np.where(finite, high, 1)
+            # Divided first: `high - low` may overflow.
+            scaled = (wide / 2 - low / 4 - high / 4) / (high / 4 - low / 4)
+            return np.where(finite, scaled, wide).astype(np.float32).reshape(len(actions), -1)
+    raise ConfigError(f"unsupported action space {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
+
+
 def check_legal_action(mask: NDArray) -> None:
     """Raise IllegalMask unless every row of an action mask (k, n) allows an action."""
     if not mask.any(axis=1).all():

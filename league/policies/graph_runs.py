@@ -21,9 +21,9 @@ TURN = 0.05
 class _Run:
     """A run, in progress or to be reused: options are expensive to create."""
 
-    __slots__ = ("begun", "limit", "options", "owner")
+    __slots__ = ("first_turn", "limit", "options", "owner")
 
-    begun: int
+    first_turn: int
     """The turn in which it began."""
     limit: float
     """Turns after which it is ended."""
@@ -73,7 +73,7 @@ def run_graph(
         run = _idle.pop() if owner is None else _Run()
     except IndexError:
         run = _Run()
-    run.begun, run.limit, run.owner = _turn, 1 + seconds / TURN, owner
+    run.first_turn, run.limit, run.owner = _turn, 1 + seconds / TURN, owner
     _runs.add(run)
     try:
         return session.run(outputs, feed, run.options)
@@ -84,7 +84,7 @@ def run_graph(
         raise
     finally:
         _runs.discard(run)
-        if owner is None and _turn + 1 - run.begun < run.limit:
+        if owner is None and _turn + 1 - run.first_turn < run.limit:
             _idle.append(run)
 
 
@@ -96,7 +96,7 @@ def end_runs(owner: object) -> None:
 
 
 def _is_over(run: _Run) -> bool:
-    return _turn - run.begun >= run.limit
+    return _turn - run.first_turn >= run.limit
 
 
 def _watch() -> None:

@@ -27,7 +27,7 @@ from league.policies.policy import Policy
 from league.policies.scripted import script
 from league.refs import CHAMPION, CheckpointRef, RemoteRef, ScriptRef, of_league, parse_ref
 from league.registry.registry import Registry
-from league.registry.storage.manifest import MAIN
+from league.registry.storage.manifest import MAIN, SEARCH
 from league.registry.storage.rows import VersionRow
 
 ANCHORS = "gate.anchors"
@@ -90,7 +90,9 @@ def players(ref: str, registry: Registry) -> dict[str, float]:
 
 
 def require_one_policy(version: VersionRow) -> None:
-    """Raise InvalidInput, which names the members, if a version is a mixture."""
+    """Raise InvalidInput, which names the versions that play, if a version has no policies of its own."""
+    if version.search is not None:
+        raise InvalidInput(f"{version.ref} searches ({version.search}): name @{version.search.version} instead")
     if version.mixture is not None:
         raise InvalidInput(f"{version.ref} is a mixture ({version.mixture}): name one of its members")
 
@@ -136,17 +138,22 @@ def _version(ref: CheckpointRef, registry: Registry | None, interface: Interface
 
 def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Policy:
     require_one_policy(version)
-    policies = version.manifest.policies
-    if policy is None and len(policies) == 1:
-        policy = next(iter(policies))
-    if policy not in policies:
+    manifest = version.manifest.policies[policy_id(version, policy)]
+    graph = registry.artifacts.read(version.manifest, manifest.file)
+    return OnnxPolicy(graph, manifest, version.manifest.has_distribution)
+
+
+def policy_id(version: VersionRow, policy: str | None) -> str:
+    """Return the id of a policy of a version; None selects the only one. Raises UnknownPolicy."""
+    ids = version.manifest.interface.policy_ids
+    if policy is None and len(ids) == 1:
+        return ids[0]
+    if policy not in ids:
         problem = (
             f"{version.ref} has no policy {policy!r}" if policy else f"{version.ref} has several policies: specify one"
         )
-        raise UnknownPolicy(f"{problem}; known: {', '.join(policies)}")
-    manifest = policies[policy]
-    graph = registry.artifacts.read(version.manifest, manifest.file)
-    return OnnxPolicy(graph, manifest, version.manifest.has_distribution)
+        raise UnknownPolicy(f"{problem}; known: {', '.join(ids)}")
+    return policy
 
 
 def pinned(ref: str, league: str, registry: Registry) -> str:
@@ -344,15 +351,17 @@ def check_plays(ref: ScriptRef | RemoteRef, interface: Interface) -> None:
 
 
 def eligible(registry: Registry, league: str) -> list[VersionRow]:
-    """Return the versions trained in the league's current environment, except retired ones and exploiters.
+    """Return the versions of the league's current environment, except retired ones, exploiters and mixtures.
 
     Raises UnknownLeague.
     """
     digest = registry.leagues.get(league).config.environment.digest()
-    present = (
-        version for version in registry.versions.all(league) if version.retired_at is None and version.role == MAIN
-    )
-    return [version for version in present if version.manifest.environment_digest == digest]
+    present = (version for version in registry.versions.all(league) if version.retired_at is None)
+    return [
+        version
+        for version in present
+        if version.role in (MAIN, SEARCH) and version.manifest.environment_digest == digest
+    ]
 
 
 def strength_opponents(

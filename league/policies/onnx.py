@@ -18,6 +18,7 @@ from league.spaces import OBSERVATION, Discrete, Space
 
 ACTION = "action"
 DIST_INPUTS = "action_dist_inputs"
+VALUE = "value"
 STATE_IN = "state_in_"
 STATE_OUT = "state_out_"
 LAST_ACTION = "state_in_action"
@@ -56,8 +57,7 @@ class OnnxPolicy:
         self._inputs = {node.name: node for node in self._session.get_inputs()}
         self._outputs = {node.name: node for node in self._session.get_outputs()}
         _check_graph(self._inputs, self._outputs, manifest)
-        self.has_distribution = has_distribution
-        self._timeout = timeout
+        self.has_distribution, self._timeout = has_distribution, timeout
         self._owner: object | None = None
         self._action = manifest.action if manifest else _discrete(self._outputs)
         self._observed = tuple(name for name in self._inputs if not name.startswith(STATE_IN))
@@ -118,9 +118,8 @@ class OnnxPolicy:
             feed = {name: observations[name] for name in self._observed}
             if self._recurrent:
                 feed |= self.initial_state(len(feed[self._observed[0]])) if state is None else state
-            rows = {name: len(array) for name, array in feed.items()}
-            if len(set(rows.values())) != 1:
-                raise ValueError(f"rows differ: {rows}")
+            if len({len(array) for array in feed.values()}) != 1:
+                raise ValueError(f"rows differ: { {name: len(array) for name, array in feed.items()} }")
             return run_graph(self._session, outputs, feed, self._timeout, self._owner)
         except GraphTimeout:
             raise

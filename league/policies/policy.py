@@ -11,9 +11,6 @@ Arrays = Mapping[str, NDArray]
 """Name of an ONNX input or output → array whose first axis is the batch."""
 MAX_BATCH = 1024
 """Observations in one request to a server, by default."""
-MAX_DECODED_BYTES = 64 * 2**20
-"""Size of the largest array of a request. Images are decoded up to it: a black one is a thousand times larger than its
-encoding."""
 
 
 class MalformedAction(Exception):

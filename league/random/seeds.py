@@ -7,7 +7,7 @@ import numpy as np
 from numpy.random.bit_generator import ISeedSequence
 from numpy.typing import NDArray
 
-from league.random.seed_sequence import generate_state
+from league.random.pcg64 import generate_state
 from policy_league_client.seeds import derive as derive
 from policy_league_client.seeds import sequence
 from policy_league_client.seeds import spawn_key as spawn_key

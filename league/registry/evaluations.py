@@ -22,7 +22,6 @@ from league.registry.storage.rows import EvaluationRow, EvaluationState
 
 QUEUED: EvaluationState = "queued"
 RUNNING: EvaluationState = "running"
-DONE: EvaluationState = "done"
 FAILED: EvaluationState = "failed"
 STOPPED: EvaluationState = "stopped"
 HEARTBEAT_TIMEOUT = timedelta(seconds=15)

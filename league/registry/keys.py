@@ -22,8 +22,8 @@ from league.registry.storage.database import Repository, insert
 from league.registry.storage.rows import KeyRow
 
 PREFIX = "plk"
-SCOPES = ("act", "read", "evaluate", "promote")
-"""What a key permits: inference, reading, starting evaluations and games, changing what is served."""
+SCOPES = ("act", "read", "evaluate", "promote", "simulate")
+"""What a key permits: inference, reading, starting evaluations and games, changing what is served, playing episodes."""
 TOKEN_LENGTH = len(PREFIX) + 1 + 8 + 1 + 64
 
 

@@ -29,8 +29,18 @@ from league.registry import leagues, versions
 from league.registry.processes import has_ended, this_process
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository, row_count
-from league.registry.storage.manifest import EXPLOITER, MIXTURE, Manifest
-from league.registry.storage.mixture import Member, Mixture, normalised
+from league.registry.storage.manifest import (
+    EXPLOITER,
+    MIXTURE,
+    SEARCH,
+    Manifest,
+    Member,
+    Mixture,
+    Role,
+    SearchRule,
+    SearchSettings,
+    normalised,
+)
 from league.registry.storage.rows import LeagueRow, VersionRow
 from league.registry.storage.tables import ABANDONED, PUBLISHING, READY, VersionTable
 from league.registry.versions import VersionRepository
@@ -110,25 +120,33 @@ class VersionPublisher(Repository):
         first = members[0].manifest
 
         def build(_: Path, number: int) -> Manifest:
-            return Manifest(
-                league=league,
-                version=number,
-                created_at=datetime.now(UTC),
-                interface=first.interface,
-                policies={},
-                environment=first.environment,
-                environment_digest=first.environment_digest,
-                algorithm=MIXTURE,
-                settings={},
-                seed=0,
-                steps=max(member.steps for member in members),
-                role=MIXTURE,
-                mixture=mixture,
-                stack={},
-            )
+            steps = max(member.steps for member in members)
+            return _without_policies(first, number, MIXTURE, mixture=mixture, steps=steps)
 
         source = "mixture/" + ",".join(f"{number}:{probability!r}" for number, probability in probabilities.items())
         return self.publish(league, build, source=source)
+
+    def publish_search(self, league: str, number: int, rule: SearchRule, simulations: int, ms: float) -> VersionRow:
+        """Publish a version that plays version `number` with a search, or return the one that does so already.
+
+        ms: see SearchSettings.
+
+        Raises:
+            UnknownLeague: The league does not exist.
+            UnknownVersion: The version does not exist.
+            VersionRetired: It has no files any more.
+            EnvironmentMismatch: It has another interface than the league.
+            InvalidInput: It is a mixture or a search version.
+        """
+        base = self._versions.get(league, number)
+        with self._database.read() as session:
+            _check_base(base, session.get_one(LeagueRow, league).interface_digest)
+        search = SearchSettings(version=number, sha256=base.sha256, rule=rule, simulations=simulations, ms=ms)
+
+        def build(_: Path, number: int) -> Manifest:
+            return _without_policies(base.manifest, number, SEARCH, search=search, steps=base.steps)
+
+        return self.publish(league, build, source=f"search/{number}:{rule}:{simulations}")
 
     def sweep(self, league: str) -> None:
         """Remove what publishers that died have left."""
@@ -143,15 +161,50 @@ class VersionPublisher(Repository):
             forget(session, league, number)
 
 
+def _without_policies(
+    first: Manifest,
+    number: int,
+    role: Role,
+    *,
+    steps: int,
+    mixture: Mixture | None = None,
+    search: SearchSettings | None = None,
+) -> Manifest:
+    """Return the manifest of a version that others play. first: of one of them."""
+    return Manifest(
+        league=first.league,
+        version=number,
+        created_at=datetime.now(UTC),
+        interface=first.interface,
+        policies={},
+        environment=first.environment,
+        environment_digest=first.environment_digest,
+        algorithm=role,
+        settings={},
+        seed=0,
+        steps=steps,
+        role=role,
+        mixture=mixture,
+        search=search,
+        stack={},
+    )
+
+
+def _check_base(version: VersionRow, interface_digest: str) -> None:
+    if version.retired_at is not None:
+        raise VersionRetired(f"{version.ref} was retired and its files were removed: it cannot play")
+    if version.mixture is not None:
+        raise InvalidInput(f"{version.ref} is a mixture ({version.mixture}): name one of its members")
+    if version.search is not None:
+        raise InvalidInput(f"{version.ref} searches ({version.search}): name @{version.search.version} instead")
+    if version.manifest.interface.digest() != interface_digest:
+        raise EnvironmentMismatch(f"{version.ref} has other spaces or policies than league {version.league} has now")
+
+
 def _check_member(member: VersionRow, first: VersionRow, interface_digest: str) -> None:
-    if member.retired_at is not None:
-        raise VersionRetired(f"{member.ref} was retired and its files were removed: it cannot play in a mixture")
-    if member.mixture is not None:
-        raise InvalidInput(f"{member.ref} is a mixture ({member.mixture}): the members of a mixture must be versions")
+    _check_base(member, interface_digest)
     if member.role == EXPLOITER:
         raise NotPromotable(f"{member.ref} has the role {EXPLOITER} (of {member.exploits}): it cannot be in a mixture")
-    if member.manifest.interface.digest() != interface_digest:
-        raise EnvironmentMismatch(f"{member.ref} has other spaces or policies than league {member.league} has now")
     if member.manifest.environment_digest != first.manifest.environment_digest:
         raise EnvironmentMismatch(
             f"{first.ref} and {member.ref} were trained in different environments: they cannot be in one mixture"

@@ -9,6 +9,7 @@ from league.registry.changes import ChangeRepository
 from league.registry.deletion.removal import RemovalRepository
 from league.registry.deletion.retention import RetentionRepository
 from league.registry.evaluations import EvaluationRepository
+from league.registry.gateways import GatewayRepository
 from league.registry.keys import KeyRepository
 from league.registry.leagues import LeagueRepository
 from league.registry.publishing import VersionPublisher
@@ -38,8 +39,7 @@ class Registry:
     """
 
     def __init__(self, storage: Storage, database: Database) -> None:
-        self.storage = storage
-        self.database = database
+        self.storage, self.database = storage, database
         self.artifacts = artifact_store(storage)
         self.leagues = LeagueRepository(database)
         self.versions = VersionRepository(database, self.artifacts)
@@ -55,6 +55,7 @@ class Registry:
         self.nightly_runs = NightlyRunRepository(database)
         self.training_nights = TrainingNightRepository(database)
         self.evaluations = EvaluationRepository(database)
+        self.gateways = GatewayRepository(database)
         self.runs = RunRepository(database)
         self.strength = StrengthRepository(database)
         self.snapshots = SnapshotRepository(database)
@@ -72,6 +73,10 @@ class Registry:
     def close(self) -> None:
         """Close the database connections."""
         self.database.close()
+
+    def needs_evaluation_service(self) -> bool:
+        """Return whether an evaluation is queued or running, or snapshots are outdated."""
+        return bool(self.evaluations.counts() or self.snapshots.stale())
 
     def exclusive_lock(self, name: str) -> AbstractContextManager[None]:
         """Hold a lock across all machines that share the database. Raises AlreadyRunning or StorageError.

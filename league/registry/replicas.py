@@ -42,6 +42,8 @@ LIVENESS_TIMEOUT = timedelta(seconds=15)
 """A replica without a report for longer is silent: dead, stuck, or cut off from the database."""
 PROCESS = "process"
 """Key in the description of a process, for its identity, see `league.registry.processes`."""
+URL = "url"
+"""Key in the description of a process, for the URL at which programs of its machine reach it without a proxy."""
 DRAINING = "draining"
 """Key in the description of a process, for a replica that is being stopped."""
 _UPDATE = update(ReplicaTable).where(ReplicaTable.replica == bindparam("name"))

@@ -6,17 +6,17 @@ The change token differs after each change of data that leaderboard, ratings or 
 from collections import defaultdict
 from collections.abc import Collection, Mapping
 from datetime import UTC, datetime
+from operator import itemgetter
 from typing import Any
 
-from sqlalchemy import Executable, func, select
-from sqlalchemy.orm import Session
+from sqlalchemy import Select, func, literal_column, select, union_all
 
 from league.interface import digest
 from league.refs import CHAMPION
 from league.registry import leagues
 from league.registry.storage.database import Repository, upsert
 from league.registry.storage.rows import AliasEvent, LeagueRow, SnapshotRow, VerdictRow
-from league.registry.storage.tables import READY, MatchTable, ScheduleTable, VersionTable
+from league.registry.storage.tables import READY, ScheduleTable, ScheduleTotalTable, VersionTable
 from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
@@ -30,8 +30,10 @@ def earlier_part(conditions: str, part: str) -> str:
     return f"earlier/{conditions}/{part}"
 
 
-_COUNTS: dict[str, Executable] = {
-    "matches": select(MatchTable.league, func.count()).group_by(MatchTable.league),
+_COUNTS: dict[str, Select[*tuple[Any, ...]]] = {
+    "matches": select(ScheduleTotalTable.league, func.sum(ScheduleTotalTable.matches))
+    .where(ScheduleTotalTable.matches > 0)
+    .group_by(ScheduleTotalTable.league),
     "purged schedules": select(ScheduleTable.league, func.count())
     .where(ScheduleTable.purged_at.is_not(None))
     .group_by(ScheduleTable.league),
@@ -45,6 +47,17 @@ _COUNTS: dict[str, Executable] = {
     ).group_by(VerdictRow.league),
 }
 """Counts that grow with every change of the data behind a snapshot: none of these rows is deleted or changed."""
+_WIDTH = max(len(query.selected_columns) for query in _COUNTS.values())
+_ALL_COUNTS = union_all(
+    *(
+        query.add_columns(*[literal_column("0")] * (_WIDTH - len(query.selected_columns)), literal_column(str(number)))
+        for number, query in enumerate(_COUNTS.values())
+    )
+)
+"""All of them in one query: league, counts, zeros up to _WIDTH columns, and the position in _COUNTS."""
+_REGISTERED = select(
+    LeagueRow.slug, LeagueRow.config_document, LeagueRow.interface_document, LeagueRow.game_digest
+).order_by(LeagueRow.slug)
 
 
 class SnapshotRepository(Repository):
@@ -102,28 +115,21 @@ class SnapshotRepository(Repository):
 
     def current_marks(self) -> dict[str, str]:
         """Return league → the mark of its current data, of all leagues."""
-        with self._database.read() as session:
-            return _current_marks(session)
+        counts: defaultdict[str, dict[int, str]] = defaultdict(dict)
+        names = [(name, len(query.selected_columns)) for name, query in _COUNTS.items()]
+        for league, *values, number in self._database.rows(_ALL_COUNTS):
+            name, width = names[number]
+            counts[league][number] = f"{name}: {' '.join(map(str, values[: width - 1]))}"
+        return {
+            league: "; ".join([str(FORMAT), digest(values)[:12], *map(itemgetter(1), sorted(counts[league].items()))])
+            for league, *values in self._database.rows(_REGISTERED)
+        }
 
     def stale(self) -> list[str]:
         """Return the leagues whose snapshots are outdated: leagues without snapshots first, then the oldest."""
         query = select(SnapshotRow.league, SnapshotRow.mark, SnapshotRow.at).filter_by(part=SUMMARY)
-        with self._database.read() as session:
-            snapshots = {league: (mark, at) for league, mark, at in session.execute(query)}
-            current = _current_marks(session)
+        snapshots = {league: (mark, at) for league, mark, at in self._database.rows(query)}
+        current = self.current_marks()
         behind = [league for league, mark in current.items() if league not in snapshots or snapshots[league][0] != mark]
         never = datetime.min.replace(tzinfo=UTC)
         return sorted(behind, key=lambda league: snapshots[league][1] if league in snapshots else never)
-
-
-def _current_marks(session: Session) -> dict[str, str]:
-    """Counts the ledger by an index-only query."""
-    counts: defaultdict[str, list[Any]] = defaultdict(list)
-    for name, query in _COUNTS.items():
-        for league, *values in session.execute(query):
-            counts[league].append(f"{name}: {' '.join(map(str, values))}")
-    table = LeagueRow
-    registered = session.execute(
-        select(table.slug, table.config_document, table.interface_document, table.game_digest).order_by(table.slug)
-    )
-    return {league: "; ".join([str(FORMAT), digest(values)[:12], *counts[league]]) for league, *values in registered}

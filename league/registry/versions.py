@@ -1,6 +1,6 @@
 """Published versions and their notes. A version is visible only once it is ready."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,8 +12,16 @@ from league.refs import CheckpointRef
 from league.registry import leagues
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
-from league.registry.storage.manifest import EXPLOITER, MIXTURE, TRAINING, Manifest
-from league.registry.storage.mixture import Mixture
+from league.registry.storage.manifest import (
+    EXPLOITER,
+    MIXTURE,
+    SEARCH,
+    TRAINING,
+    Manifest,
+    Mixture,
+    Role,
+    SearchSettings,
+)
 from league.registry.storage.rows import Note, VersionRow, VersionState
 from league.registry.storage.tables import READY, AliasTable, VersionNoteTable, VersionTable
 
@@ -51,9 +59,7 @@ class VersionRepository(Repository):
 
     def all(self, league: str) -> list[VersionRow]:
         """Return all versions of a league, oldest first. Raises UnknownLeague."""
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return _rows(session, league, list(session.scalars(_ready(league).order_by(VersionTable.number))))
+        return self._list(league, _ready(league).order_by(VersionTable.number))
 
     def newest(self, league: str, *, before: int | None = None, limit: int = 20) -> list[VersionRow]:
         """Return at most `limit` versions of a league, newest first. Raises UnknownLeague.
@@ -63,16 +69,17 @@ class VersionRepository(Repository):
         query = _ready(league).order_by(VersionTable.number.desc()).limit(limit)
         if before is not None:
             query = query.where(VersionTable.number < before)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return _rows(session, league, list(session.scalars(query)))
+        return self._list(league, query)
 
     def exploiters(self, league: str, targets: Collection[str]) -> list[VersionRow]:
         """Return the exploiters of the versions `targets`, except retired ones, oldest first. Raises UnknownLeague."""
         query = _ready(league).where(VersionTable.exploits.in_(targets), VersionTable.retired_at.is_(None))
+        return self._list(league, query.order_by(VersionTable.number))
+
+    def _list(self, league: str, query: Select[VersionTable]) -> list[VersionRow]:
         with self._database.read() as session:
             leagues.require(session, league)
-            return _rows(session, league, list(session.scalars(query.order_by(VersionTable.number))))
+            return _rows(session, league, list(session.scalars(query)))
 
     def exploiter_refs(self, league: str) -> set[str]:
         """Return the references of all exploiters of a league, retired ones included. Does not read manifests."""
@@ -110,6 +117,17 @@ class VersionRepository(Repository):
         """Return the mixtures among some versions, by one cheap query."""
         with self._database.read() as session:
             return mixtures(session, league, numbers)
+
+    def searches(self, league: str, numbers: Collection[int]) -> dict[int, SearchSettings]:
+        """Return the searches of the search versions among some versions."""
+        with self._database.read() as session:
+            return searches(session, league, numbers)
+
+    def players(self, league: str, numbers: Collection[int]) -> dict[int, tuple[int, ...]]:
+        """Return the versions whose policies play, of those among some versions that have none: the members of a
+        mixture, and the version that a search version plays."""
+        with self._database.read() as session:
+            return players(session, league, numbers)
 
     def fetch(self, league: str, number: int) -> Path:
         """Return a local directory with the verified files of a version. Raises ArtifactCorrupt or VersionRetired."""
@@ -178,7 +196,7 @@ def require(session: Session, league: str, number: int) -> None:
 
 def require_files(session: Session, league: str, number: int) -> None:
     """Raise UnknownLeague, UnknownVersion or VersionRetired unless the version is ready and has its files, as have its
-    members if it is a mixture.
+    members if it is a mixture, and the version that it plays if it is a search version.
     """
     for version in (number, *sorted(members(session, league, [number]))):
         require(session, league, version)
@@ -198,19 +216,32 @@ def require_promotable(session: Session, league: str, number: int) -> None:
 
 def mixtures(session: Session, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
     """Return the mixtures among some versions."""
-    query = select(VersionTable.number, VersionTable.manifest).filter_by(league=league, state=READY, role=MIXTURE)
-    mixture_by_number: dict[int, Mixture] = {}
-    for number, text in session.execute(query.where(VersionTable.number.in_(numbers))):
-        assert text is not None, "a ready version has a manifest"
-        mixture = Manifest.from_json(text, source=f"the manifest of {league}@{number}").mixture
-        assert mixture is not None, "the manifest checks it"
-        mixture_by_number[number] = mixture
-    return mixture_by_number
+    manifests = _manifests(session, league, MIXTURE, numbers)
+    return {number: manifest.mixture for number, manifest in manifests if manifest.mixture is not None}
+
+
+def searches(session: Session, league: str, numbers: Collection[int]) -> dict[int, SearchSettings]:
+    """Return the searches of the search versions among some versions."""
+    manifests = _manifests(session, league, SEARCH, numbers)
+    return {number: manifest.search for number, manifest in manifests if manifest.search is not None}
+
+
+def players(session: Session, league: str, numbers: Collection[int]) -> dict[int, tuple[int, ...]]:
+    """Return the members of the mixtures among some versions, and what the search versions among them play."""
+    of_mixtures = {number: mixture.versions for number, mixture in mixtures(session, league, numbers).items()}
+    return of_mixtures | {number: (search.version,) for number, search in searches(session, league, numbers).items()}
 
 
 def members(session: Session, league: str, numbers: Collection[int]) -> set[int]:
-    """Return the members of the mixtures among some versions."""
-    return {number for mixture in mixtures(session, league, numbers).values() for number in mixture.versions}
+    """Return all versions that `players` returns."""
+    return {number for versions in players(session, league, numbers).values() for number in versions}
+
+
+def _manifests(session: Session, league: str, role: Role, numbers: Collection[int]) -> Iterator[tuple[int, Manifest]]:
+    query = select(VersionTable.number, VersionTable.manifest).filter_by(league=league, state=READY, role=role)
+    for number, text in session.execute(query.where(VersionTable.number.in_(numbers))):
+        assert text is not None, "a ready version has a manifest"
+        yield number, Manifest.from_json(text, source=f"the manifest of {league}@{number}")
 
 
 def _retired(league: str, number: int) -> None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linprog, minimize
 from scipy.special import logsumexp, softmax
 
 Floats = NDArray[np.float64]
@@ -46,25 +45,24 @@ def alpha_rank(scores: ArrayLike, selection: float = 100.0, population: int = 50
     # Where e^-mu overflows, the limit e^(m-1)u is almost 0, but every contestant must stay reachable.
     fixation = np.maximum(np.nan_to_num(fixation), SMALLEST)
     rates = fixation / max(1, table.shape[-1] - 1)
-    flat = rates.reshape(-1, *rates.shape[-2:])
-    return np.stack([_stationary(matrix) for matrix in flat]).reshape(table.shape[:-1])
+    return _stationary(rates)
 
 
 def _stationary(rates: Floats) -> Floats:
-    """Stationary distribution of the Markov chain with these off-diagonal rates.
+    """Stationary distributions (..., n) of the Markov chains with these off-diagonal rates (..., n, n).
 
     State elimination without subtraction keeps the smallest probabilities accurate (Grassmann, Taksar and Heyman,
     1985).
     """
     chain = rates.copy()
-    size = len(chain)
+    size = chain.shape[-1]
     for last in range(size - 1, 0, -1):
-        chain[:last, last] /= chain[last, :last].sum()
-        chain[:last, :last] += np.outer(chain[:last, last], chain[last, :last])
-    share = np.ones(size)
+        chain[..., :last, last] /= chain[..., last, :last].sum(axis=-1, keepdims=True)
+        chain[..., :last, :last] += chain[..., :last, last, None] * chain[..., None, last, :last]
+    share = np.ones(chain.shape[:-1])
     for state in range(1, size):
-        share[state] = share[:state] @ chain[:state, state]
-    return np.asarray(share / share.sum())
+        share[..., state] = (share[..., :state] * chain[..., :state, state]).sum(axis=-1)
+    return np.asarray(share / share.sum(axis=-1, keepdims=True))
 
 
 def nash_averaging(payoff: ArrayLike) -> tuple[Floats, Floats]:
@@ -82,6 +80,8 @@ def nash_averaging(payoff: ArrayLike) -> tuple[Floats, Floats]:
     table = np.asarray(payoff, dtype=np.float64)
     if table.ndim != 2 or table.shape[0] != table.shape[1] or not np.allclose(table, -table.T, atol=1e-9):
         raise ValueError(f"the payoff must be a square antisymmetric matrix, not of shape {table.shape}")
+    if (share := _only_equilibrium(table)) is not None:
+        return share, table @ share
     support = _support(table)
     share = np.zeros(len(table))
     other_strategies = np.setdiff1d(np.arange(len(table)), support)
@@ -101,6 +101,8 @@ def _support(table: Floats) -> NDArray[np.intp]:
     best = np.flatnonzero((table < 0).sum(axis=0) == size - 1)
     if best.size or not table.any():
         return best if best.size else np.arange(size)
+    from scipy.optimize import linprog  # takes 0.2 s to import
+
     ones, no_gain = np.ones((size, 1)), np.concatenate([table, np.zeros((size, 1))], axis=1)
     solved = linprog(
         -np.eye(size + 1)[size],
@@ -111,6 +113,38 @@ def _support(table: Floats) -> NDArray[np.intp]:
     )
     share = np.asarray(solved.x)[:size]
     return np.flatnonzero(share > -table @ share)
+
+
+def _only_equilibrium(table: Floats) -> Floats | None:
+    """The equilibrium (n,), if it is the only one by a margin; None if it may not be.
+
+    The simplex method on `max sum(x)` subject to `(table + c) @ x <= 1`, c such that all payoffs are positive (R.
+    Luce and H. Raiffa, "Games and decisions", 1957, appendix 5), finds an equilibrium. It is the only one if all other
+    contestants lose against it, and within its support only one p satisfies `table @ p = 0`.
+    """
+    size = len(table)
+    payoffs = table + 1 - table.min()
+    tableau = np.block([[payoffs, np.eye(size), np.ones((size, 1))], [-np.ones(size), np.zeros(size + 1)]])
+    basis = np.arange(size, 2 * size)
+    for _ in range(PIVOTS * size):
+        entering = int(tableau[-1].argmin())
+        if tableau[-1, entering] > -MARGIN:
+            break
+        column = tableau[:-1, entering]
+        ratios = np.divide(tableau[:-1, -1], column, out=np.full(size, np.inf), where=column > MARGIN)
+        leaving = int(ratios.argmin())
+        tableau[leaving] /= tableau[leaving, entering]
+        rates = tableau[:, entering].copy()
+        rates[leaving] = 0
+        tableau -= np.multiply.outer(rates, tableau[leaving])
+        basis[leaving] = entering
+    support = np.sort(basis[(basis < size) & (tableau[:-1, -1] > MARGIN)])
+    _, singular, rows = np.linalg.svd(table[np.ix_(support, support)])
+    share = np.zeros(size)
+    share[support] = rows[-1] * np.copysign(1.0, rows[-1, 0])
+    is_only = (singular > MARGIN).sum() == len(support) - 1 and (share[support] > MARGIN).all()
+    gains = np.delete(table @ share, support)
+    return share / share.sum() if is_only and (gains < -MARGIN).all() else None
 
 
 def _most_even(inside: Floats, outside: Floats) -> Floats:
@@ -128,6 +162,8 @@ def _most_even(inside: Floats, outside: Floats) -> Floats:
     if not len(rows):
         return np.full(len(inside), 1 / len(inside))
 
+    from scipy.optimize import minimize  # takes 0.2 s to import
+
     def dual(multipliers: Floats) -> tuple[float, Floats]:
         logits = -rows.T @ multipliers
         return float(logsumexp(logits)), np.asarray(-rows @ softmax(logits))
@@ -143,6 +179,10 @@ def _most_even(inside: Floats, outside: Floats) -> Floats:
     return np.asarray(softmax(-rows.T @ solved.x))
 
 
+PIVOTS = 10
+"""Steps of the simplex method per contestant. It takes about two per contestant of the support."""
+MARGIN = 1e-7
+"""Probabilities and payoffs below this may be rounding errors."""
 SMALLEST = 1e-250
 """Transition rate towards a contestant that always loses. Any positive number keeps the chain irreducible."""
 

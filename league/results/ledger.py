@@ -1,13 +1,14 @@
 """The append-only store of matches. It accepts each scheduled match once."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from itertools import groupby
+from itertools import chain, groupby
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, TypeVarTuple
+from typing import Any
 
-from sqlalchemy import Select, Subquery, func, select, tuple_, union_all, update
+from sqlalchemy import Select, Subquery, delete, func, or_, select, tuple_, union_all, update
 from sqlalchemy.orm import Session
 
 from league.conditions import Conditions
@@ -17,7 +18,7 @@ from league.refs import CheckpointRef
 from league.registry import leagues
 from league.registry.registry import Registry
 from league.registry.storage import tables
-from league.registry.storage.database import insert
+from league.registry.storage.database import insert, upsert_all
 from league.results.records import (
     BlockResult,
     LedgerEntry,
@@ -30,9 +31,10 @@ from league.results.records import (
     load_numbers,
     load_schedule,
 )
+from league.results.schedule_sums import ScheduleSums
 from league.results.scoring import admit
+from league.results.sums import Pair, PairSums, pair_of, total
 
-Columns = TypeVarTuple("Columns")
 RESERVE = 256 * 2**20
 """Bytes of the disk with an SQLite database that games must leave free, for promotions and acknowledgements."""
 MOST_BYTES = 4 * 2**30
@@ -46,8 +48,6 @@ class Ledger:
 
     def __init__(self, registry: Registry) -> None:
         self._database = registry.database
-        self._sizes: dict[str, int] = {}
-        """Schedule → size of its recorded games in bytes, if this object has added some."""
 
     def open(self, schedule: Schedule) -> Schedule:
         """Store a schedule unless its id exists; returns the stored one. Raises UnknownLeague."""
@@ -55,7 +55,9 @@ class Ledger:
         with self._database.write() as session:
             leagues.require(session, schedule.league)
             insert(session, tables.ScheduleTable, [row | {"opened_at": datetime.now(UTC)}])
-            return _schedule(session, schedule.id)
+            stored = _schedule(session, schedule.id)
+            insert(session, tables.ScheduleTotalTable, [ScheduleSums(stored).total()])
+            return stored
 
     def schedules(self, league: str) -> list[Schedule]:
         """Return all schedules of a league in the order in which they were opened. Raises UnknownLeague."""
@@ -98,32 +100,32 @@ class Ledger:
                 f"{free // 2**20} MB are free on the disk of {file}: games are recorded only if they leave "
                 f"{RESERVE // 2**20} MB; what was played so far is kept"
             )
+        batches, stored_at = [], datetime.now(UTC)
+        # In one order, so that transactions do not wait for each other.
+        for schedule in map(self.schedule, sorted({match.schedule for match in matches})):
+            group = [match for match in matches if match.schedule == schedule.id]
+            for match, seed in zip(group, schedule.seeds_at([match.position for match in group]), strict=True):
+                admit(match, schedule, seed)
+            batches.append((schedule, [(match, row(match, stored_at)) for match in group]))
         with self._database.write() as session:
-            schedules = {name: _schedule(session, name) for name in {match.schedule for match in matches}}
-            for schedule in schedules.values():
-                group = [match for match in matches if match.schedule == schedule.id]
-                for match, seed in zip(group, schedule.seeds_at([match.position for match in group]), strict=True):
-                    admit(match, schedule, seed)
-            stored_at = datetime.now(UTC)
-            rows = [row(match, stored_at) for match in matches]
-            for name in schedules:
-                self._add_size(
-                    session, name, sum(len(record["moves"]) for record in rows if record["schedule"] == name)
-                )
-            return insert(session, tables.MatchTable, rows)
+            return sum(_extend(session, schedule, group) for schedule, group in batches)
 
-    def _add_size(self, session: Session, schedule: str, size: int) -> None:
-        """Count the size of new games of a schedule. Raises OutOfSpace."""
-        if schedule not in self._sizes:
-            moves = tables.MatchTable.moves
-            recorded = select(func.coalesce(func.sum(func.length(moves)), 0)).filter_by(schedule=schedule)
-            self._sizes[schedule] = int(session.scalar(recorded) or 0)
-        if self._sizes[schedule] + size > MOST_BYTES:
-            raise OutOfSpace(
-                f"the recorded games of schedule {schedule} would exceed {MOST_BYTES // 2**20:,} MB: "
-                "what was played so far is kept"
-            )
-        self._sizes[schedule] += size
+    def recount(self, schedule: Schedule, mend: bool = True) -> list[str]:
+        """Compute the sums of a schedule from its matches; returns which stored ones differ.
+
+        mend: replace these. Matches can be added at the same time.
+        """
+        while True:
+            sums = ScheduleSums(schedule)
+            for batch in self._batches(schedule):
+                sums.add(batch)
+            with self._database.write() as session:
+                _lock_total(session, schedule)
+                match = tables.MatchTable
+                query = select(func.count(), func.coalesce(func.sum(func.length(match.moves)), 0))
+                number, sums.size = session.execute(query.where(match.schedule == schedule.id)).one()
+                if number == sums.matches:
+                    return _differences(session, schedule, sums, mend)
 
     def matches(self, *, league: str, schedule: str | None = None) -> list[Match]:
         """Return the matches of a league, or of one of its schedules, in schedule order."""
@@ -131,22 +133,29 @@ class Ledger:
             schedules = {
                 league_schedule.id: league_schedule for league_schedule in _schedules(session, league, schedule)
             }
-            query = _in_order(
-                select(tables.MatchTable.schedule, tables.MatchTable.position, tables.MatchTable.moves), league
+            match = tables.MatchTable
+            query = (
+                select(match.schedule, match.position, match.moves)
+                .join(tables.ScheduleTable, tables.ScheduleTable.id == match.schedule)
+                .where(tables.ScheduleTable.league == league)
+                .order_by(tables.ScheduleTable.sequence, match.position)
             )
             if schedule is not None:
-                query = query.where(tables.MatchTable.schedule == schedule)
+                query = query.where(match.schedule == schedule)
             groups = groupby(session.execute(query), key=attrgetter("schedule"))
             return [match for name, rows in groups for match in _matches(schedules[name], list(rows))]
 
     def walk(self, schedule: Schedule) -> Iterator[Match]:
         """Iterate over the matches of a schedule in order, with at most STRIDE of them in memory."""
+        return chain.from_iterable(self._batches(schedule))
+
+    def _batches(self, schedule: Schedule) -> Iterator[list[Match]]:
         last, table = -1, tables.MatchTable
         query = select(table.position, table.moves).filter_by(schedule=schedule.id).order_by(table.position)
         while True:
             with self._database.read() as session:
                 rows = session.execute(query.where(table.position > last).limit(STRIDE)).all()
-            yield from _matches(schedule, rows)
+            yield _matches(schedule, rows)
             if len(rows) < STRIDE:
                 return
             last = rows[-1].position
@@ -206,53 +215,73 @@ class Ledger:
 
     def counts(self, league: str) -> dict[str, int]:
         """Return schedule → number of played matches, of the schedules of a league that have any."""
-        match = tables.MatchTable
-        query = select(match.schedule, func.count()).filter_by(league=league).group_by(match.schedule)
+        total = tables.ScheduleTotalTable
+        query = select(total.schedule, total.matches).where(total.league == league, total.matches > 0)
         with self._database.read() as session:
             return dict(session.execute(query).tuples().all())
 
     def has_played(self, ref: str, conditions: Conditions) -> bool:
-        """Return whether a version has a match under these conditions that counts."""
-        match = tables.MatchTable
+        """Return whether a version has a match under these conditions, also if it is not counted."""
+        pair = tables.PairSumTable
         league = CheckpointRef.parse(ref).league
-        query = select(match.schedule).filter_by(league=league).distinct()
+        query = select(pair.schedule).where(pair.league == league, or_(pair.first == ref, pair.second == ref))
         with self._database.read() as session:
-            counted = {
-                league_schedule.id
-                for league_schedule in _schedules(session, league)
-                if league_schedule.conditions == conditions and ref in league_schedule.contestants
-            }
             return any(
-                schedule in counted
-                for side in (match.first, match.second)
-                for schedule in session.scalars(query.where(side == ref))
+                _schedule(session, schedule).conditions == conditions for schedule in session.scalars(query).all()
             )
 
-    def results(
-        self, league: str, conditions: Conditions | None = None, between: tuple[str, str] | None = None
-    ) -> list[BlockResult]:
-        """Return the matches of a league without moves, in schedule order.
+    def counted(self, league: str, conditions: Conditions) -> list[Schedule]:
+        """Return the schedules of a league that were played under these conditions, in the order of their opening.
 
-        conditions, between: only those played under these conditions, and between these two contestants. Excludes
-        purged schedules, and cross-play in one team, which does not show who is stronger.
+        Excludes purged schedules, and cross-play in one team, which does not show who is stronger.
         """
-        match = tables.MatchTable
-        columns = match.schedule, match.position, match.games, match.scores, match.returns
+        purged = self.purged(league)
+        return [
+            schedule
+            for schedule in self.schedules(league)
+            if schedule.conditions == conditions and schedule.scoring != "team" and schedule.id not in purged
+        ]
+
+    def sums(
+        self, league: str, schedules: Iterable[Schedule], between: tuple[str, str] | None = None
+    ) -> dict[Pair, PairSums]:
+        """Return the sums over the matches of some schedules of a league, which must not be changed.
+
+        between: only those of these two contestants.
+        """
+        pair = tables.PairSumTable
+        query = select(pair.schedule, pair.first, pair.second, pair.sums).filter_by(league=league)
+        if between is not None:
+            first, second = pair_of(between)
+            query = query.filter_by(first=first, second=second)
+        return {
+            pair: total(tuple([text for _, text in parts])) for pair, parts in self._texts(query, schedules).items()
+        }
+
+    def examples(self, league: str, schedules: Iterable[Schedule]) -> dict[Pair, list[tuple[str, str]]]:
+        """Return examples of the games of each pair: the schedule, and what `load_examples` reads."""
+        pair = tables.PairSumTable
+        query = select(pair.schedule, pair.first, pair.second, pair.examples).filter_by(league=league)
+        return self._texts(query, schedules)
+
+    def _texts(
+        self, query: Select[str, str, str, str], schedules: Iterable[Schedule]
+    ) -> dict[Pair, list[tuple[str, str]]]:
+        """Pair → schedule and text, of these schedules. query: schedules, contestants and texts."""
+        names, texts = {schedule.id for schedule in schedules}, defaultdict[Pair, list[tuple[str, str]]](list)
         with self._database.read() as session:
-            schedules = {
-                schedule.id: schedule
-                for schedule in _schedules(session, league)
-                if conditions in (None, schedule.conditions) and schedule.scoring != "team"
-            }
-            query = _in_order(select(*columns), league).where(tables.ScheduleTable.purged_at.is_(None))
-            if between is not None:
-                query = query.where(tuple_(match.first, match.second).in_([between, between[::-1]]))
-            match_rows = session.execute(query)
-            return [
-                _result(match_row, schedules[match_row.schedule].contestants_at(match_row.position))
-                for match_row in match_rows
-                if match_row.schedule in schedules
-            ]
+            for name, first, second, text in session.execute(query).tuples():
+                if name in names:
+                    texts[first, second].append((name, text))
+        return dict(texts)
+
+    def digests(self, league: str) -> Iterator[tuple[str, int, bytes]]:
+        """Iterate over the digests of a league's games by schedule: first position, and the digests from there."""
+        row = tables.GameDigestTable
+        query = select(row.schedule, row.stripe, row.digests).filter_by(league=league).order_by(row.schedule)
+        with self._database.read() as session:
+            for schedule, stripe, digests in session.execute(query).tuples():
+                yield schedule, stripe * tables.STRIPE, digests
 
 
 _LISTED = tuple(
@@ -318,10 +347,75 @@ def _result(row: Any, contestants: tuple[str, ...]) -> BlockResult:
     return BlockResult(row.schedule, row.position, contestants, row.games, load_numbers(row.scores), returns)
 
 
-def _in_order(query: Select[*Columns], league: str) -> Select[*Columns]:
-    query = query.join(tables.ScheduleTable, tables.ScheduleTable.id == tables.MatchTable.schedule)
-    query = query.where(tables.ScheduleTable.league == league)
-    return query.order_by(tables.ScheduleTable.sequence, tables.MatchTable.position)
+def _extend(session: Session, schedule: Schedule, matches: Sequence[tuple[Match, Mapping[str, Any]]]) -> int:
+    """Add matches of one schedule, with their rows and sums; returns the number of new ones. Raises OutOfSpace."""
+    total, table = _lock_total(session, schedule), tables.MatchTable
+    first: dict[int, tuple[Match, Mapping[str, Any]]] = {}
+    for match, record in matches:
+        first.setdefault(match.position, (match, record))
+    query = select(table.position).where(table.schedule == schedule.id)
+    recorded = set(session.scalars(query.where(table.position.between(min(first), max(first)))))
+    new = [added for position, added in first.items() if position not in recorded]
+    if not new:
+        return 0
+    total.matches += len(new)
+    total.size += sum(len(record["moves"]) for _, record in new)
+    if total.size > MOST_BYTES:
+        raise OutOfSpace(
+            f"the recorded games of schedule {schedule.id} would exceed {MOST_BYTES // 2**20:,} MB: "
+            "what was played so far is kept"
+        )
+    insert(session, table, [record for _, record in new])
+    _add_to_sums(session, schedule, [match for match, _ in new])
+    return len(new)
+
+
+def _lock_total(session: Session, schedule: Schedule) -> tables.ScheduleTotalTable:
+    """Until the transaction ends, no other one adds matches to the schedule. Raises NotFound."""
+    query = select(tables.ScheduleTotalTable).filter_by(schedule=schedule.id)
+    if (total := session.scalars(query.with_for_update()).one_or_none()) is None:
+        raise NotFound(f"there is no schedule {schedule.id!r}")
+    return total
+
+
+def _add_to_sums(session: Session, schedule: Schedule, matches: Sequence[Match]) -> None:
+    sums, pair, digest = ScheduleSums(schedule), tables.PairSumTable, tables.GameDigestTable
+    pairs = sorted({pair_of(match.contestants) for match in matches})
+    stripes = {match.position // tables.STRIPE for match in matches}
+    query = select(pair.first, pair.second, pair.sums, pair.examples).filter_by(schedule=schedule.id)
+    for start in range(0, len(pairs), PAIRS):
+        some = tuple_(pair.first, pair.second).in_(pairs[start : start + PAIRS])
+        sums.load(session.execute(query.where(some)), ())
+    stored = select(digest.stripe, digest.digests).filter_by(schedule=schedule.id)
+    sums.load((), session.execute(stored.where(digest.stripe.in_(stripes))))
+    sums.add(matches)
+    upsert_all(session, pair, ("schedule", "first", "second"), sums.pair_rows())
+    upsert_all(session, digest, ("schedule", "stripe"), sums.digest_rows())
+
+
+def _differences(session: Session, schedule: Schedule, sums: ScheduleSums, mend: bool) -> list[str]:
+    """Which stored sums of a schedule differ from `sums`, and with `mend` are replaced."""
+    differences = []
+    for table, key, rows in (
+        (tables.ScheduleTotalTable, ("schedule",), [sums.total()]),
+        (tables.PairSumTable, ("first", "second"), sums.pair_rows()),
+        (tables.GameDigestTable, ("stripe",), sums.digest_rows()),
+    ):
+        stored = session.execute(select(*table.__table__.columns).filter_by(schedule=schedule.id)).mappings()
+        before, after = (
+            {tuple(record[name] for name in key): dict(record) for record in part} for part in (stored, rows)
+        )
+        differing = sorted(place for place in before.keys() | after.keys() if before.get(place) != after.get(place))
+        if differing:
+            differences += [f"{table.__tablename__} of {' '.join(map(str, place))}" for place in differing]
+            if mend:
+                session.execute(delete(table).filter_by(schedule=schedule.id))
+                insert(session, table, rows)
+    return differences
+
+
+PAIRS = 500
+"""Pairs of contestants in a query."""
 
 
 def row(match: Match, played_at: datetime) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from league.errors import NotFound
 from league.results.equilibria import alpha_rank, nash_averaging
-from league.results.records import BlockResult
+from league.results.records import Outcome
 
 METHODS = ("nash", "alpha_rank")
 UNKNOWN = 0.5
@@ -50,7 +50,7 @@ class MetaStrategy:
         return tuple((np.array(self.payoff) @ drawn).tolist())
 
 
-def meta_strategy(refs: Sequence[str], results: Iterable[BlockResult], method: str = "nash") -> MetaStrategy:
+def meta_strategy(refs: Sequence[str], results: Iterable[Outcome], method: str = "nash") -> MetaStrategy:
     """Compute the meta-strategy of some contestants. Those without a game against another one are left out.
 
     Args:
@@ -67,7 +67,7 @@ def meta_strategy(refs: Sequence[str], results: Iterable[BlockResult], method: s
         raise ValueError(f"method {method!r}: expected {' or '.join(METHODS)}")
     if len(refs) < 2:
         raise NotFound(
-            f"the league has {len(refs)} versions, expected at least two: `league train CONFIG` publishes them"
+            f"expected at least two versions, the league has {len(refs)}: `league train CONFIG` publishes them"
         )
     contestants = set(refs)
     pairs = [
@@ -85,13 +85,13 @@ def meta_strategy(refs: Sequence[str], results: Iterable[BlockResult], method: s
         refs=playing,
         probabilities=tuple(shares.tolist()),
         payoff=tuple(map(tuple, table.tolist())),
-        games=sum(result.games for result in pairs),
+        games=sum(result.games * result.matches for result in pairs),
         unmet=len(playing) * (len(playing) - 1) // 2 - len(met),
     )
 
 
 def payoff_matrix(
-    contestants: Sequence[str], results: Iterable[BlockResult], rows: Mapping[str, Scores]
+    contestants: Sequence[str], results: Iterable[Outcome], rows: Mapping[str, Scores]
 ) -> NDArray[np.float64]:
     """Return the mean score of each contestant against each other, shrunk towards ½, (n, n).
 
@@ -110,7 +110,7 @@ def payoff_matrix(
 
     for result in results:
         if len(result.contestants) == 2:
-            add(*result.contestants, result.games, result.scores[0])
+            add(*result.contestants, result.games * result.matches, result.scores[0] * result.matches)
     for ref, row in rows.items():
         for other, (count, score) in row.items():
             add(ref, other, count, score)

@@ -166,8 +166,21 @@ class Game:
 
 
 @dataclass(frozen=True, slots=True)
+class Outcome:
+    """How some matches of two contestants ended, the input of ratings and payoffs.
+
+    games: the number of games of each contestant in a match. scores: sums over them. matches: number of such matches.
+    """
+
+    contestants: tuple[str, ...]
+    games: int
+    scores: tuple[float, ...]
+    matches: int = 1
+
+
+@dataclass(frozen=True, slots=True)
 class BlockResult:
-    """A match without its moves, the input of ratings and payoffs.
+    """A match without its moves.
 
     games: the number of games of each contestant. scores and returns are sums over them.
     A block with a forfeit has no returns, because the returns of an aborted game are not comparable.
@@ -179,6 +192,10 @@ class BlockResult:
     games: int
     scores: tuple[float, ...]
     returns: tuple[float, ...] | None
+
+    @property
+    def outcome(self) -> Outcome:
+        return Outcome(self.contestants, self.games, self.scores)
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,8 +279,9 @@ def dump_schedule(schedule: Schedule) -> str:
     return _ENCODER.encode({name: getattr(schedule, name) for name in Schedule.__slots__})
 
 
+@lru_cache(maxsize=1024)
 def load_schedule(text: str) -> Schedule:
-    """Return the schedule that `dump_schedule` wrote."""
+    """Return the schedule that `dump_schedule` wrote. Recent ones are kept: results read all schedules of a league."""
     fields = json.loads(text)
     fields["pairings"] = tuple(tuple(pairing) for pairing in fields["pairings"])
     return Schedule(**fields | {name: tuple(fields[name]) for name in ("sides", "contestants")})

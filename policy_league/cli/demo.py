@@ -11,6 +11,7 @@ from rich.rule import Rule
 from league.settings import Storage
 from policy_league.cli.options import DEFAULT_URL, open_registry
 from policy_league.cli.output import console, say
+from policy_league.cli.training.options import PRELOADED
 from policy_league.configs.bundled import find
 
 if TYPE_CHECKING:
@@ -67,16 +68,19 @@ def demo(
 
 
 def _train(config: "LeagueConfig", minutes: float) -> None:
-    from evaluation.service.strength_process import StrengthProcess
-    from training.runs.train import train
+    from league.ray_cluster import LocalRay, connected
 
     _step(1, f"Train for {minutes:g} minutes by masked PPO (RLlib, Ray Tune): self-play, and games against {OPPONENT}.")
     say(f"The policy also imitates {TEACHER['ref']}, a search to a depth of four moves, most of all at first.")
     say("Each checkpoint is exported to ONNX, tested for identical actions, and published as a version.")
     paced = config.with_training(minutes=minutes, checkpoint_minutes=minutes / VERSIONS, teacher=TEACHER)
     registry = open_registry()
-    with closing(StrengthProcess(registry.storage)) as measure:
-        train(paced, registry=registry, config_path=find(LEAGUE), console=console, measure=measure)
+    with connected(None, registry.storage, LocalRay(preload=PRELOADED)):
+        from evaluation.service.strength_process import StrengthProcess
+        from training.runs.train import train
+
+        with closing(StrengthProcess(registry.storage)) as measure:
+            train(paced, registry=registry, config_path=find(LEAGUE), console=console, measure=measure)
 
 
 def _play(config: "LeagueConfig", url: str) -> None:
@@ -98,9 +102,9 @@ def _play(config: "LeagueConfig", url: str) -> None:
     moves = [move for step in steps for move in step.moves]
     board = next(drawing(e.observation["observation"]) for e in steps[-1].endings if e.agent == 0)
     outcome = steps[-1].returns[first]
-    say(f"\n{board}\n")
-    say("Moves: " + " ".join(f"{'●' if move.agent == first else '○'}{move.action}" for move in moves))
-    say("The champion won." if outcome > 0 else "The champion lost." if outcome < 0 else "A draw.")
+    played = " ".join(f"{'●' if move.agent == first else '○'}{move.action}" for move in moves)
+    end = "The champion won." if outcome > 0 else "The champion lost." if outcome < 0 else "A draw."
+    say(f"\n{board}\n\nMoves: {played}\n{end}")
 
 
 def drawing(planes: "NDArray") -> str | None:
@@ -121,19 +125,20 @@ def _mark(square: "NDArray") -> str:
 def _show_next_steps(league: str, url: str, first: str = "") -> None:
     say("")
     console.print(Rule("Next steps", align="left"))
-    if first:
-        say(first)
-    say(f"Open {url} in a browser for the leaderboard, verdicts and recorded games, and")
-    say(f"  {url}/leagues/{league}/play    to play against the champion.")
-    say("In another terminal, after `source .venv/bin/activate`:")
-    if url != DEFAULT_URL:
-        say(f"  export LEAGUE_URL={url}")
-    say(f"  league act {league}@champion            request an action over HTTP")
-    say(f"  league versions {league}                list versions with aliases and ratings")
-    say(f"  league evaluate {league}                play a round robin of all versions and scripts")
-    say(f"  league promote {league}@1               change the champion; replicas follow within a second")
-    say(f"  league history {league}                 show past champions and the reasons for the changes")
-    say(f"  league train {LEAGUE} --from {league}@champion")
+    lines = (
+        first,
+        f"Open {url} in a browser for the leaderboard, verdicts and recorded games, and",
+        f"  {url}/leagues/{league}/play    to play against the champion.",
+        "In another terminal, after `source .venv/bin/activate`:",
+        "" if url == DEFAULT_URL else f"  export LEAGUE_URL={url}",
+        f"  league act {league}@champion            request an action over HTTP",
+        f"  league versions {league}                list versions with aliases and ratings",
+        f"  league evaluate {league}                play a round robin of all versions and scripts",
+        f"  league promote {league}@1               change the champion; replicas follow within a second",
+        f"  league history {league}                 show past champions and the reasons for the changes",
+        f"  league train {LEAGUE} --from {league}@champion",
+    )
+    say("\n".join(filter(None, lines)))
 
 
 def _step(number: int, sentence: str) -> None:

@@ -46,6 +46,7 @@ PANELS = {
         "compare": Subcommand(
             "leagues.comparison:compare", "Compare two training runs: settings, speed, curves and versions."
         ),
+        "recount": Subcommand("leagues.recount:recount", "Compute the sums behind ratings from the ledger again."),
         "remove": Subcommand("leagues.removal:remove", "Remove a league, or one of its versions, with all files."),
     },
     "Evaluate": {
@@ -73,9 +74,13 @@ PANELS = {
             "versions.importing:import_model", "Publish a model that was trained elsewhere as a version."
         ),
         "export": Subcommand("versions.exporting:export", "Write the ONNX files and the manifest of a version."),
+        "export-games": Subcommand(
+            "versions.exporting:export_games", "Write the recorded games of a league as Parquet, to learn from."
+        ),
         "promote": Subcommand(
             "versions.aliases:promote", "Make a version or a mixture the champion, or move another alias to it."
         ),
+        "search": Subcommand("versions.searching:search", "Publish a version that plays another one with a search."),
         "retire": Subcommand("versions.retire:retire", "Remove files of old versions, and old access logs."),
         "mixture": Subcommand("versions.aliases:mixture", "Point an alias to the equilibrium of a league, or show it."),
         "rollback": Subcommand("versions.aliases:rollback", "Restore the previous champion."),

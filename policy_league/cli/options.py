@@ -61,7 +61,9 @@ def open_registry() -> "Registry":
 
 @cache
 def _registry_class() -> "type[Registry]":
+    gc.disable()  # What is imported stays until the end. Searching it for garbage takes 0.1 s.
     from league.registry.registry import Registry
 
-    gc.freeze()  # The imported modules stay until the end. Searching them for garbage takes 0.1 s.
+    gc.freeze()
+    gc.enable()
     return Registry

@@ -9,11 +9,13 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, TextIO
 
 import orjson
+import typer
 from rich.cells import cell_len
 from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
+from league.errors import InvalidInput
 from league.refs import short_verdict
 
 if TYPE_CHECKING:
@@ -62,6 +64,17 @@ def say(sentence: str = "") -> None:
 def complain(sentence: str) -> None:
     """Print an error or a warning to stderr."""
     errors.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
+
+
+def confirm(question: str, hint: str, *, yes: bool, as_json: bool = False) -> None:
+    """Ask for confirmation, unless --yes gave it. Ends the command if it is refused.
+
+    Raises InvalidInput with `hint` without a terminal, or with --json.
+    """
+    if not yes:
+        if as_json or not sys.stdin.isatty():
+            raise InvalidInput(hint)
+        typer.confirm(question, abort=True)
 
 
 def warn_of_changed_game(registry: "Registry", league: str) -> None:
@@ -250,20 +263,15 @@ class GameProgress:
                 if line:
                     say(line)
             return
-        note = _note(event)
+        places = None if event.nodes is None else f"{counted(event.nodes, 'node')}, {counted(event.cpus or 0, 'CPU')}"
+        speed = None if event.moves_per_second is None else f"{event.moves_per_second:,.0f} moves/s"
+        llr = None if event.llr is None else f"LLR {event.llr:+.2f}"
+        note = "  ".join(filter(None, (places, speed, llr)))
         self._bar.update(self._task, description=text(event.what), completed=event.played, total=event.of, note=note)
         if not self._has_bar and time.monotonic() >= self._next_line:
             self._next_line = time.monotonic() + SECONDS_PER_LINE
             line = f"{event.what}: {event.played}/{event.of} matches  {note}"
             say(line.rstrip())
-
-
-def _note(event: "Games") -> str:
-    """`2 nodes, 8 CPUs  25,000 moves/s  LLR +1.20`"""
-    places = None if event.nodes is None else f"{counted(event.nodes, 'node')}, {counted(event.cpus or 0, 'CPU')}"
-    speed = None if event.moves_per_second is None else f"{event.moves_per_second:,.0f} moves/s"
-    llr = None if event.llr is None else f"LLR {event.llr:+.2f}"
-    return "  ".join(filter(None, (places, speed, llr)))
 
 
 def show_leaderboard(leaderboard: "tuple[Standing, ...]", explanation: str | None = None) -> None:

@@ -76,7 +76,9 @@ class Crossing(MultiAgentEnv):
         self.colours, self.time = next_colours, self.time + 1
         paid = {agent: rewards[road][i] for agent, (road, i) in self.place.items() if agent in self.agents}
         paid |= dict.fromkeys(self.lights, light_reward)
-        passed = {agent: self._distance(agent) == 0 for agent in self.place if agent in self.agents}
+        passed = {
+            agent: self.distances[road][i] == 0 for agent, (road, i) in self.place.items() if agent in self.agents
+        }
         self.agents = [agent for agent in self.agents if not passed.get(agent, False)]
         all_passed = not any(map(any, self.distances))
         terminated = passed | {"__all__": all_passed}
@@ -103,10 +105,6 @@ class Crossing(MultiAgentEnv):
             rows, columns = (across, along) if road == 0 else (along, across)
             picture[rows : rows + 14, columns : columns + 14] = (90, 150, 230) if road == 0 else (235, 170, 70)
         return picture
-
-    def _distance(self, agent: str) -> int:
-        road, i = self.place[agent]
-        return self.distances[road][i]
 
     def _observations(self) -> dict[str, Any]:
         return {agent: self._observation(agent) for agent in self.agents}

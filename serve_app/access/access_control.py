@@ -10,7 +10,6 @@ long-lived.
 """
 
 from collections.abc import Awaitable, Iterable
-from contextlib import nullcontext
 from time import monotonic
 from typing import Any, NamedTuple
 
@@ -32,10 +31,17 @@ from serve_app.settings import ServeSettings
 
 KEY = "league.key"
 """Scope entry of a request with a valid key: its `ApiKey`."""
+ADMISSION = "league.admission"
+"""Scope entry of a request that was accepted before it reached the middleware: its `Admission`."""
 DEADLINE = "league.deadline"
 """Scope entry of an HTTP request: when its timeout ends, as a time of `time.monotonic`."""
 BEARER = b"bearer "
-HEADERS = ORIGIN_HEADERS | {b"authorization", b"x-api-key", b"x-request-timeout-ms"}
+SUBPROTOCOL = "policy-league"
+"""WebSocket subprotocol of streams. A page in a browser cannot set headers, and offers its key as another one."""
+KEY_SUBPROTOCOL = b"policy-league.key."
+HEADERS = ORIGIN_HEADERS | {b"authorization", b"sec-websocket-protocol", b"x-api-key", b"x-request-timeout-ms"}
+KEY_HEADER = (KEY_ACCEPTED.encode(), b"1")
+"""Header of a response to a request with a key."""
 NO_SNIFFING = (b"x-content-type-options", b"nosniff")
 """Header of every response: browsers must not guess another type than the declared one."""
 DENIAL = "websocket.http.response"
@@ -64,10 +70,13 @@ class AccessControl:
         self._is_exposed = is_exposed
         self.backlog = Backlog(settings.max_waiting, settings.max_turn, settings.burst_tolerance)
         self._frames = TokenBucket(FRAMES)
+        self._is_first = True
 
     @property
     def requires_key(self) -> bool:
         """Whether requests need an API key."""
+        if self._settings.cors_origins:
+            return True
         if self._settings.require_keys == "auto":
             return self._is_exposed or not self._api_keys.is_empty
         return self._settings.require_keys == "always"
@@ -90,20 +99,21 @@ class AccessControl:
             self.backlog.admit()
         return key
 
-    def requirement(self, scope: Scope) -> RequiredPermission:
-        """The permission that an HTTP request or a WebSocket handshake requires."""
-        return self._permissions.for_request(scope["type"], scope.get("method", "GET"), _path(scope))
-
-    def admit_request(self, scope: Scope, need: RequiredPermission, headers: "RequestHeaders") -> ApiKey | None:
-        """Accept an HTTP request or a WebSocket handshake, and return its key.
+    def admission(self, scope: Scope, path: str) -> "Admission":
+        """Accept an HTTP request or a WebSocket handshake. path: relative to the root path.
 
         Raises UntrustedHost, CrossSiteRequest, and the errors of `admit`.
         """
+        if self._is_first and (server := scope.get("server")):
+            self._is_first = False
+            self.backlog.watch_port(server[1])
+        headers, method = _read_headers(scope["headers"]), scope.get("method", "GET")
+        need = self._permissions.for_request(scope["type"], method, path)
         if self.is_local_only:
             reject_foreign_host(scope["headers"])
         if headers.is_browser:
-            reject_cross_site(scope["type"], scope.get("method", "GET"), scope["headers"])
-        return self.admit(need, headers.token)
+            reject_cross_site(scope["type"], method, scope["headers"], self._settings.cors_origins)
+        return Admission(headers, need, self.admit(need, headers.token))
 
     def admit_message(self, key: ApiKey | None, size: int) -> None:
         """Accept a message of a stream that was opened with `key`. size: in bytes.
@@ -210,25 +220,21 @@ class AccessControlMiddleware:
         self._errors = errors
         self._timeout = settings.timeout
         self._in_flight = ConnectionLimit("requests", settings.max_in_flight, settings.max_in_flight)
-        self._is_first = True
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request to the application, or respond with an error."""
         if (kind := scope["type"]) == "lifespan":
             await self._application(scope, receive, send)
             return
-        if self._is_first and (server := scope.get("server")):
-            self._is_first = False
-            self._access.backlog.watch_port(server[1])
+        path = _path(scope)
         if self._log is not None:
-            send = self._log.begin(scope, _path(scope), send)
+            send = self._log.begin(scope, path, send)
         response = ResponseTracker(send)
         try:
-            headers, need = _read_headers(scope["headers"]), self._access.requirement(scope)
-            key = self._access.admit_request(scope, need, headers)
+            headers, need, key = scope.pop(ADMISSION, None) or self._access.admission(scope, path)
             if key is not None:
                 scope[KEY] = key
-                response.add_header(KEY_ACCEPTED.encode(), b"1")
+                response.add_header(*KEY_HEADER)
                 if self._log is not None:
                     scope[LOG_ENTRY]["key"] = key.name
             if kind != "http" or need.is_stream:
@@ -236,7 +242,10 @@ class AccessControlMiddleware:
                 return
             timeout = self._timeout if headers.timeout is None else min(_seconds(headers.timeout), self._timeout)
             scope[DEADLINE] = monotonic() + timeout
-            with nullcontext() if _path(scope).startswith(UNLIMITED) else self._in_flight.opened(None):
+            if path.startswith(UNLIMITED):
+                await run_within(timeout, self._application(scope, receive, response.send))
+                return
+            with self._in_flight.opened(None):
                 await run_within(timeout, self._application(scope, receive, response.send))
         except LeagueError as error:
             if response.has_started:
@@ -244,7 +253,11 @@ class AccessControlMiddleware:
             await self._refuse(error, scope, receive, response.send)
         except TimeLimitExceeded:
             if not response.has_started:  # otherwise the client is not reading, and uvicorn closes the connection
-                await self._refuse(_timeout_error(scope, timeout), scope, receive, response.send)
+                if scope["method"] == "POST" and BODY_READ not in scope:
+                    timed_out: LeagueError = BodyTooSlow(f"the request body did not arrive within {timeout:g} s")
+                else:
+                    timed_out = DeadlineExceeded(f"the request timed out after {timeout:g} s")
+                await self._refuse(timed_out, scope, receive, response.send)
 
     async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket" and DENIAL not in scope.get("extensions", {}):
@@ -308,6 +321,15 @@ class RequestHeaders(NamedTuple):
     """Whether the request has a header of ORIGIN_HEADERS."""
 
 
+class Admission(NamedTuple):
+    """An accepted request."""
+
+    headers: RequestHeaders
+    need: RequiredPermission
+    key: ApiKey | None
+    """None if it needs no key."""
+
+
 def _read_headers(headers: Iterable[tuple[bytes, bytes]]) -> RequestHeaders:
     token, timeout, is_browser = None, None, False
     for name, value in headers:
@@ -318,6 +340,11 @@ def _read_headers(headers: Iterable[tuple[bytes, bytes]]) -> RequestHeaders:
                 token = value.strip()
             elif name in ORIGIN_HEADERS:
                 is_browser = True
+            elif name == b"sec-websocket-protocol":
+                offered = (protocol.strip() for protocol in value.split(b","))
+                token = next(
+                    (text[len(KEY_SUBPROTOCOL) :] for text in offered if text.startswith(KEY_SUBPROTOCOL)), token
+                )
             elif value[: len(BEARER)].lower() == BEARER:
                 token = value[len(BEARER) :].strip()
     return RequestHeaders(token, timeout, is_browser)
@@ -327,12 +354,6 @@ def _seconds(milliseconds: bytes) -> float:
     if not (milliseconds.isdigit() and len(milliseconds) <= 9 and int(milliseconds)):
         raise InvalidInput("x-request-timeout-ms must be a positive number of milliseconds")
     return int(milliseconds) / 1000
-
-
-def _timeout_error(scope: Scope, timeout: float) -> LeagueError:
-    if scope["method"] == "POST" and BODY_READ not in scope:
-        return BodyTooSlow(f"the request body did not arrive within {timeout:g} s")
-    return DeadlineExceeded(f"the request timed out after {timeout:g} s")
 
 
 def _path(scope: Scope) -> str:

@@ -1,10 +1,11 @@
 """Sheds load before a queue builds up: requests beyond the limits are refused at once with 429.
 
-A replica handles requests on one event loop, and runs small inferences on it. Its queue is therefore implicit: requests
-that arrived while the loop was busy, all of which start in the next turn, and connections that are not accepted yet. A
-turn starts at most `limit` requests, and only those that it reaches within `time_limit` seconds. As in CoDel (Nichols
-and Jacobson, 2012, "Controlling queue delay"), bursts may exceed both limits; requests are refused only when the queue
-stays too long for more than `burst_tolerance` seconds.
+A replica handles requests on one event loop, and runs small inferences on it. Most of its queue is therefore implicit:
+requests that arrived while the loop was busy, all of which start in the next turn, and connections that are not
+accepted yet. Those of the fast path wait in a queue of their own. A turn accepts requests until `limit` of them wait,
+and only those that it reaches within `time_limit` seconds. As in CoDel (Nichols and Jacobson, 2012, "Controlling queue
+delay"), bursts may exceed both limits; requests are refused only when the queue stays too long for more than
+`burst_tolerance` seconds.
 """
 
 import asyncio
@@ -20,8 +21,8 @@ NEVER = float("inf")
 class Backlog:
     """The requests of one turn of the event loop.
 
-    While overloaded, a turn starts at most `limit` requests, and none after `time_limit` seconds, but always at least
-    one.
+    While overloaded, a turn accepts requests until `limit` wait, and none after `time_limit` seconds, but always at
+    least one if none waits.
     """
 
     __slots__ = (
@@ -35,6 +36,7 @@ class Backlog:
         "_turn_started",
         "_unaccepted",
         "_waiting",
+        "queued",
         "turn",
     )
 
@@ -48,6 +50,8 @@ class Backlog:
         self._queue: AcceptQueue | None = None
         self._unaccepted = 0
         self._waiting = 0
+        self.queued = 0
+        """Accepted requests of earlier turns that still wait."""
         self.turn = 0
         """Number of turns in which requests were admitted."""
         self._turn_started = 0.0
@@ -85,11 +89,11 @@ class Backlog:
         loop.call_soon(loop.call_soon, self._end_queue)  # after the next turn
 
     def _end_queue(self) -> None:
-        """The queue is empty if a turn passes without a request and no connection waits to be accepted."""
-        if not self._is_continuing and not (self._queue and self._queue.length()):
+        """The queue is empty if a turn passes without a request, and none waits, nor a connection to be accepted."""
+        if not self._is_continuing and not self.queued and not (self._queue and self._queue.length()):
             self._overloaded_since = NEVER
 
     def _is_overloaded(self) -> bool:
-        if self._waiting + self._unaccepted > self._limit:
+        if self.queued + self._waiting + self._unaccepted > self._limit:
             return True
         return self._waiting > 1 and self._clock() - self._turn_started > self._time_limit

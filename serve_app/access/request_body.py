@@ -11,8 +11,8 @@ import orjson
 from starlette.types import Receive, Scope
 
 from league.errors import BodyTooLarge
+from league.spaces.observation_codec import json_type
 from serve_app.access.errors import MalformedBody, UnsupportedMediaType
-from serve_app.codecs.observation_codec import json_type
 
 JSON_TYPES = (b"application/json", b"text/json", b"text/plain", b"application/x-www-form-urlencoded")
 """Media types accepted as JSON. The last is curl's default."""
@@ -28,7 +28,7 @@ BODY_READ = "league.body_is_read"
 async def read_body(scope: Scope, receive: Receive, limit: int) -> bytes:
     """Read a JSON body of at most `limit` bytes. Raises the errors of `read_bytes`, or UnsupportedMediaType."""
     for name, value in scope["headers"]:
-        if name == b"content-type":
+        if name == b"content-type" and value not in JSON_TYPES:
             media_type = value.partition(b";")[0].strip().lower()
             if media_type not in JSON_TYPES and not media_type.endswith(b"+json"):
                 type_name = media_type.decode("latin-1")[:64]
@@ -44,27 +44,31 @@ async def read_bytes(scope: Scope, receive: Receive, limit: int) -> bytes:
     """
     encoding = b""
     for name, value in scope["headers"]:
-        if name == b"content-length" and int(value) > limit:
-            raise _too_large(limit)
-        if name == b"content-encoding":
+        if name == b"content-length":
+            if int(value) > limit:
+                raise _too_large(limit)
+        elif name == b"content-encoding":
             encoding = value.strip().lower()
             if encoding not in WINDOW_BITS and encoding not in UNCOMPRESSED:
                 encoding_name = encoding.decode("latin-1")[:64]
                 raise UnsupportedMediaType(
                     f"the Content-Encoding is {encoding_name!r}, expected gzip, deflate or identity"
                 )
-    parts, size, more = list[bytes](), 0, True
-    while more and size <= limit:
+    parts, size = list[bytes](), 0
+    while True:
         message = await receive()
         if message["type"] == "http.disconnect":
             raise MalformedBody("the connection closed before the body was complete")
-        parts.append(message.get("body", b""))
-        size += len(parts[-1])
-        more = message.get("more_body", False)
-    if size > limit:
-        raise _too_large(limit)
+        body: bytes = message.get("body", b"")
+        size += len(body)
+        if size > limit:
+            raise _too_large(limit)
+        if not message.get("more_body", False):
+            break
+        parts.append(body)
     scope[BODY_READ] = True
-    body = b"".join(parts)
+    if parts:
+        body = b"".join((*parts, body))
     return body if encoding in UNCOMPRESSED else await decompressed(body, encoding, limit)
 
 

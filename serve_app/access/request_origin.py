@@ -8,7 +8,7 @@ A page of another site cannot set the headers that carry an API key, but it coul
   then to 127.0.0.1. The `Host` header still has the name, and a page cannot change it either.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from functools import lru_cache
 from ipaddress import ip_address
 
@@ -25,15 +25,19 @@ MAX_AUTHORITY = 262
 """Length of the longest host name (RFC 1035) with a port."""
 
 
-def reject_cross_site(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]]) -> None:
+def reject_cross_site(
+    kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], trusted: Collection[str] = ()
+) -> None:
     """Raise CrossSiteRequest if a page of another origin sent a request that is not GET or HEAD, or opens a WebSocket.
 
-    kind: The ASGI scope type.
+    kind: The ASGI scope type. trusted: Origins whose pages may do so.
     """
     if kind == "http" and method in SAFE_METHODS:
         return
     values = dict(headers)
     site, origin = values.get(b"sec-fetch-site"), values.get(b"origin")
+    if origin is not None and origin.decode("latin-1") in trusted:
+        return
     # "same-site" is not enough: it includes pages on other ports of this machine.
     if site is not None:
         is_ours = site in SAME_ORIGIN

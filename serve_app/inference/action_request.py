@@ -1,8 +1,10 @@
 """An action request: parsed and checked, executed, and encoded as a response."""
 
 import asyncio
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -10,22 +12,27 @@ from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, InvalidInput, InvalidState
 from league.policies.draws import probabilities
-from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions
 from league.random.seeds import generator
+from league.search.searched_actions import SearchedActions
 from league.spaces import ACTION_MASK
-from serve_app.codecs.observation_codec import json_type, read_state, reject_strings
+from league.spaces.observation_codec import json_type, read_state, reject_strings
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
 from serve_app.codecs.state_tokens import read_state as state_of_tokens
+from serve_app.live_versions.remote_search import RemoteSearch
 from serve_app.live_versions.resolver import version_of
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.version_cache import Graph, LoadedPolicy, LoadedVersion
 
-KEYS = frozenset(("observation", "observations", "state", "explore", "seed", "probabilities"))
+KEYS = frozenset(
+    ("observation", "observations", "state", "explore", "seed", "probabilities", "deadline_ms", "analysis")
+)
 OBSERVATIONS = ("observation", "observations")
+MOST_MS = 24 * 60 * 60 * 1000
+"""The longest time limit of a search, in milliseconds."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class DecodedActionRequest:
     """A request for actions."""
 
@@ -40,6 +47,10 @@ class DecodedActionRequest:
     """Whether to sample the actions; None for the league's default."""
     seed: int | list[int] | None
     probabilities: bool
+    deadline: float
+    """When a search ends with the best actions so far, a time of `time.monotonic`; infinity for all simulations."""
+    analysis: bool
+    """Whether to return what a search expects."""
     strings: int
     """Number of strings in the document, including keys, except those in the observations."""
 
@@ -59,6 +70,7 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
         raise BodyTooLarge(f"observations has {len(observations)} items, expected at most {max_batch}")
     explore = parse_flag(document, "explore") if "explore" in document else None
     probabilities = parse_flag(document, "probabilities")
+    analysis, deadline = parse_flag(document, "analysis"), _deadline(document.get("deadline_ms"))
     seed = document.get("seed")
     _check_seed(seed, len(observations) if is_batch else None)
     arrays, tokens, strings = None, None, len(document)
@@ -68,7 +80,9 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
         else:
             tokens = _tokens(state, len(observations) if is_batch else None)
             strings += sum(token is not None for token in tokens)
-    return DecodedActionRequest(observations, is_batch, arrays, tokens, explore, seed, probabilities, strings)
+    return DecodedActionRequest(
+        observations, is_batch, arrays, tokens, explore, seed, probabilities, deadline, analysis, strings
+    )
 
 
 def reject_unknown_keys(document: dict[str, Any], known: frozenset[str]) -> None:
@@ -130,6 +144,14 @@ def _check_seed(seed: Any, batch: int | None) -> None:
         raise InvalidInput("seed must be null or an integer from 0 to 2^63 - 1, or in a batch a list of such integers")
 
 
+def _deadline(milliseconds: Any) -> float:
+    if milliseconds is None:
+        return math.inf
+    if type(milliseconds) is not int or not 0 < milliseconds <= MOST_MS:
+        raise InvalidInput(f"deadline_ms must be null or an integer from 1 to {MOST_MS}")
+    return monotonic() + milliseconds / 1000
+
+
 Arrays = dict[str, NDArray]
 
 
@@ -184,10 +206,17 @@ async def execute(
     state: Arrays | None,
     rng: Sequence[np.random.Generator] | None = None,
     with_distribution: bool = False,
+    deadline: float = math.inf,
+    with_lines: bool = False,
 ) -> Actions:
-    """Run the graph, in a thread if the batch is large. rng: explore, with one generator per row."""
+    """Run the graph, in a thread if the batch is large. rng: explore, with one generator per row.
 
-    def act(graph: OnnxPolicy) -> Actions:
+    deadline, with_lines: of a search.
+    """
+
+    def act(graph: Graph) -> Actions:
+        if isinstance(graph, RemoteSearch):
+            graph = graph.bounded(deadline, with_lines)
         if with_distribution and rng is None:
             return graph.distribution(observations, state=state)
         return graph.act(observations, state=state, explore=rng is not None, rng=rng)
@@ -199,16 +228,24 @@ async def execute_request(
     request: DecodedActionRequest, policy: LoadedPolicy, observations: Arrays, state: Arrays | None
 ) -> tuple[Actions, bool]:
     """Run the graph with the request's seed. Returns the actions, and whether they are greedy."""
+    if request.analysis and policy.search is None:
+        raise InvalidInput("analysis is true, but this version does not search")
     rng = generators(request.seed, len(request.observations)) if is_sampled(request.explore, policy) else None
-    return await execute(policy, observations, state, rng, request.probabilities), rng is None
+    answer = await execute(policy, observations, state, rng, request.probabilities, request.deadline, request.analysis)
+    return answer, rng is None
 
 
 def build_response(
     request: DecodedActionRequest, answer: Actions, observations: Arrays, policy: LoadedPolicy
 ) -> dict[str, Any]:
-    """The response's `action` or `actions`, and its `probabilities`."""
+    """The response's `action` or `actions`, its `probabilities`, and what is known from a search."""
     actions = answer.actions.tolist()
-    response = {"actions": actions} if request.is_batch else {"action": actions[0]}
+    response: dict[str, Any] = {"actions": actions} if request.is_batch else {"action": actions[0]}
+    if isinstance(answer, SearchedActions):
+        rows: dict[str, list[Any]] = {"simulations": answer.simulations()}
+        if request.analysis:
+            rows["analysis"] = answer.analyses()
+        response |= rows if request.is_batch else {name: values[0] for name, values in rows.items()}
     if request.probabilities:
         assert answer.dist_inputs is not None
         # An action that is certain has the probability 1 even if it is illegal.

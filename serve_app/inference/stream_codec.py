@@ -20,7 +20,7 @@ from league.errors import BodyTooLarge, InvalidInput, ObservationError
 from league.policies.onnx import ACTION
 from league.spaces import ACTION_MASK, Leaf
 from league.spaces.arrays import check, check_mask
-from serve_app.codecs.binary_leaves import little_endian
+from league.spaces.binary_leaves import little_endian
 from serve_app.live_versions.version_cache import LoadedPolicy
 
 FRAMING = 1
@@ -73,12 +73,19 @@ class BinaryCodec:
             raise ObservationError(
                 f"the tensors have {len(request.tensors)} bytes, expected {size}: {request.rows} rows of {parts}"
             )
-        arrays, at = {}, 0
+        slices, at = list[memoryview](), 0
         for tensor in self._inputs:
             end = at + request.rows * tensor.size
-            array = little_endian(tensor.name, request.tensors[at:end], tensor.dtype)
-            arrays[tensor.name] = check(tensor.name, array.reshape(request.rows, *tensor.leaf.shape), tensor.leaf)
+            slices.append(request.tensors[at:end])
             at = end
+        return self.arrays(slices, request.rows)
+
+    def arrays(self, tensors: Iterable[bytes | memoryview], rows: int) -> dict[str, NDArray]:
+        """The graph's inputs from the bytes of each. Raises ObservationError or IllegalMask."""
+        arrays = {}
+        for tensor, data in zip(self._inputs, tensors, strict=True):
+            array = little_endian(tensor.name, data, tensor.dtype).reshape(rows, *tensor.leaf.shape)
+            arrays[tensor.name] = check(tensor.name, array, tensor.leaf)
         if self._is_masked:
             check_mask(arrays[ACTION_MASK])
         return arrays

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from league.errors import InvalidInput, InvalidState, LeagueError, RateLimited, Unauthenticated
 from league.policies.policy import Actions
 from league.refs import CHAMPION
+from league.spaces.observation_codec import json_type
 from serve_app.access.access_control import POLICY_VIOLATION, AccessControl
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.errors import MalformedBody, status_of
 from serve_app.access.request_body import parse_json_object
-from serve_app.codecs.observation_codec import json_type
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import read_state, write_tokens
 from serve_app.inference.action_request import (
@@ -40,6 +40,7 @@ from serve_app.inference.action_request import (
     read_observations,
     reject_unknown_keys,
 )
+from serve_app.inference.stream_batches import StreamBatches
 from serve_app.inference.stream_codec import BinaryCodec, parse_request
 from serve_app.live_versions.alias_slots import AliasSlots
 from serve_app.live_versions.resolver import ModelResolver, policy_ref
@@ -75,8 +76,8 @@ class ServedPolicy(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class StreamDependencies:
-    """Objects that all streams of a replica share."""
+class InferenceDependencies:
+    """Objects that the streams and the fast path of a replica share."""
 
     models: ModelResolver
     slots: AliasSlots
@@ -91,17 +92,19 @@ class StreamSession:
     """The session of one connection; messages are passed in one at a time.
 
     follows: the alias to follow; None pins the version of `served`. headers: those of the handshake; the caller's key
-    may route a stream that follows the champion to the canary, and selects the member of a mixture.
+    may route a stream that follows the champion to the canary, and selects the member of a mixture. batches: of all
+    streams, if the connection can wait for them.
     """
 
     def __init__(
         self,
-        dependencies: StreamDependencies,
+        dependencies: InferenceDependencies,
         model: str,
         served: tuple[LoadedVersion, LoadedPolicy],
         follows: str | None,
         headers: Headers,
         key: ApiKey | None,
+        batches: StreamBatches | None = None,
     ) -> None:
         self._dependencies = dependencies
         self._model = model
@@ -110,6 +113,7 @@ class StreamSession:
         self._follows = follows
         self._headers = headers
         self._key = key
+        self._batches = batches
         self._served = ServedPolicy.of(model, *served)
         self._state: Arrays | None = None
         """Recurrent state, one row per observation of the last message; None at the start of episodes."""
@@ -178,9 +182,13 @@ class StreamSession:
         request = parse_request(data, self._dependencies.settings.max_batch)
         served, state = self._continue(request.rows, request.reset, request.resets)
         observations = served.codec.read(request)
-        rng = generators(request.seed, request.rows) if is_sampled(request.explore, served.policy) else None
-        answer = await execute(served.policy, observations, state, rng)
-        self._mirror(served, observations, state, answer.actions if rng is None else None)
+        explore = is_sampled(request.explore, served.policy)
+        if self._batches is not None and state is None and request.seed is None and not served.policy.state:
+            answer = await self._batches.act(served.policy, observations, request.rows, explore)
+        else:
+            rng = generators(request.seed, request.rows) if explore else None
+            answer = await execute(served.policy, observations, state, rng)
+        self._mirror(served, observations, state, None if explore else answer.actions)
         self._store_state(served, answer, is_batch=request.rows > 1)
         message = StreamMessage(served.codec.write(answer.actions, served.version.number), False)
         self._count(served, request.rows, start)

@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 from numpy.typing import NDArray
 
 from league.errors import InvalidInput, Overloaded
-from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT, OnnxPolicy
+from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.policies.policy import Actions
 from league.refs import CHAMPION
 from serve_app.codecs.request_limits import LARGE_BODY
@@ -20,7 +20,7 @@ from serve_app.inference_protocol.tensors import RequestTensor, Signature, read_
 from serve_app.live_versions.resolver import ModelResolver, policy_ref
 from serve_app.live_versions.shadow import MirrorFunction, Shadow
 from serve_app.live_versions.traffic_split import Headers
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.version_cache import Graph, LoadedPolicy, LoadedVersion
 from serve_app.observability.metrics import Metrics
 from serve_app.settings import ServeSettings
 
@@ -91,7 +91,10 @@ class Inference:
 
     async def find(self, model: str, version: str, headers: Headers = ()) -> ProtocolModel:
         """The policy that answers for a model. Raises the errors of `ModelResolver.find`."""
-        loaded, policy = await self._models.find(model, version or CHAMPION, headers)
+        return self.of_loaded(model, *await self._models.find(model, version or CHAMPION, headers))
+
+    def of_loaded(self, model: str, loaded: LoadedVersion, policy: LoadedPolicy) -> ProtocolModel:
+        """What `find` returns for a policy that is in memory."""
         signature = self._signatures.get(policy)
         if signature is None:
             signature = self._signatures[policy] = signature_of(policy.manifest)
@@ -109,7 +112,7 @@ class Inference:
         lookup_end = perf_counter_ns()
         entry = self.statistics.entry(served.name, served.version.number)
         try:
-            output_names = _wanted(request.outputs, served.signature)
+            output_names = wanted_outputs(request.outputs, served.signature)
             if request.is_sequence and served.signature.is_recurrent:
                 raise InvalidInput("sequences are not supported: send state_out_<i> back as state_in_<i>")
             arrays = await self._read(request, served.signature)
@@ -133,7 +136,7 @@ class Inference:
         return await asyncio.to_thread(read_inputs, request.inputs, signature, self._settings.max_batch)
 
 
-def _wanted(outputs: Sequence[str], signature: Signature) -> Sequence[str]:
+def wanted_outputs(outputs: Sequence[str], signature: Signature) -> Sequence[str]:
     """Names of the requested outputs. Raises InvalidInput."""
     if not outputs:
         return list(signature.outputs)
@@ -151,7 +154,7 @@ async def _run(
     ports = served.signature.inputs
     state = {name: array for name, array in arrays.items() if ports[name].is_state} or None
 
-    def act(policy: OnnxPolicy) -> Actions:
+    def act(policy: Graph) -> Actions:
         if DIST_INPUTS in wanted:
             return policy.outputs(arrays, state=state)
         return policy.act(arrays, state=state)
@@ -159,10 +162,11 @@ async def _run(
     answer = await served.policy.run(act, len(next(iter(arrays.values()))))
     if mirror is not None:
         mirror({name: array for name, array in arrays.items() if not ports[name].is_state}, state, answer.actions)
-    return {name: _output(name, answer) for name in wanted}
+    return {name: output_of(name, answer) for name in wanted}
 
 
-def _output(name: str, answer: Actions) -> NDArray:
+def output_of(name: str, answer: Actions) -> NDArray:
+    """The output of a graph by its name in the protocol."""
     if name == ACTION:
         return answer.actions
     if name == DIST_INPUTS:

@@ -23,6 +23,7 @@ from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import Inference, InferResponse
 from serve_app.inference_protocol.rest_codec import compressed, read_request, write_response
 from serve_app.live_versions.registry_watcher import RegistryWatcher
+from serve_app.live_versions.traffic_split import Headers
 from serve_app.settings import ServeSettings
 
 JSON, BINARY = b"application/json", b"application/octet-stream"
@@ -243,7 +244,7 @@ class InferRoute:
             await self._handle(scope, receive, send)
 
     async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        header_length, accepted = _headers(scope)
+        header_length, accepted = framing(scope["headers"])
         turn = self._access.backlog.turn
         body = await read_bytes(scope, receive, self._settings.max_body)
         if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
@@ -262,7 +263,7 @@ class InferRoute:
             return write_response(response, request)
 
         response, length = await self._inference.infer(request.infer, write, scope["headers"])
-        headers = [self._replica, (b"content-type", JSON if length is None else BINARY)]
+        headers = [(b"content-type", JSON if length is None else BINARY)]
         if length is not None:
             headers.append((HEADER_LENGTH, b"%d" % length))
         if accepted:
@@ -270,15 +271,15 @@ class InferRoute:
             headers.append((b"vary", b"accept-encoding"))
             if encoding is not None:
                 headers.append((b"content-encoding", encoding))
-        headers.append((b"content-length", b"%d" % len(response)))
+        headers += [(b"content-length", b"%d" % len(response)), self._replica]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": response})
 
 
-def _headers(scope: Scope) -> tuple[int | None, bytes]:
+def framing(headers: Headers) -> tuple[int | None, bytes]:
     """Inference-Header-Content-Length and Accept-Encoding. Raises InvalidInput."""
     header_length, accepted = None, b""
-    for name, value in scope["headers"]:
+    for name, value in headers:
         if name == HEADER_LENGTH:
             if not value.isdigit() or len(value) > LENGTH_DIGITS:
                 raise InvalidInput("Inference-Header-Content-Length must be a number of bytes")

@@ -15,9 +15,9 @@ import numpy as np
 import orjson
 
 from league.errors import InvalidInput
+from league.spaces.observation_codec import json_type
 from serve_app.access.errors import MalformedBody
 from serve_app.access.request_body import WINDOW_BITS, parse_json_object
-from serve_app.codecs.observation_codec import json_type
 from serve_app.inference_protocol.inference import InferRequest, InferResponse
 from serve_app.inference_protocol.tensors import RequestTensor, datatype_of, to_bytes
 

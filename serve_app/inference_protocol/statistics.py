@@ -1,8 +1,8 @@
 """Inference statistics of a replica by policy and version, in the protocol's format: counts and durations in
 nanoseconds.
 
-Each row counts as an inference, and each run of a graph as an execution. There is no cache; its fields are 0. Requests
-do not wait in a queue: its count is that of the answered requests, and its duration 0.
+Each row counts as an inference, and each run of a graph as an execution, also if it answers several requests. There is
+no cache; its fields are 0.
 """
 
 import time
@@ -42,8 +42,12 @@ class ModelStatistics:
     last_inference: int = 0
     """Milliseconds since the epoch; 0 before the first."""
     inference_count: int = 0
+    execution_count: int = 0
     success: Duration = field(default_factory=Duration)
     failure: Duration = field(default_factory=Duration)
+    queue: Duration = field(default_factory=Duration)
+    """Waiting to be answered, and looking up the version. Clients such as perf_analyzer read from its count which
+    version has answered."""
     input: Duration = field(default_factory=Duration)
     """Decoding and checking tensors."""
     infer: Duration = field(default_factory=Duration)
@@ -55,11 +59,13 @@ class ModelStatistics:
         """Count a request that failed after `ns` nanoseconds."""
         self.failure.add(ns)
 
-    def succeed(self, rows: int, begun: int, found: int, read: int, ran: int, done: int) -> None:
-        """Count a request of `rows` observations; the other arguments are times in nanoseconds."""
+    def succeed(self, rows: int, begun: int, found: int, read: int, ran: int, done: int, executions: int = 1) -> None:
+        """Count a request of `rows` observations, and the runs for it; the other arguments are times in nanoseconds."""
         self.last_inference = time.time_ns() // 1_000_000
         self.inference_count += rows
+        self.execution_count += executions
         self.success.add(done - begun)
+        self.queue.add(found - begun)
         self.input.add(read - found)
         self.infer.add(ran - read)
         self.output.add(done - ran)
@@ -67,18 +73,16 @@ class ModelStatistics:
     def document(self, name: str, version: int) -> dict[str, Any]:
         """In the format of the statistics extension."""
         nothing = Duration().document()
-        # Nothing waits, but clients such as perf_analyzer read from this count which version has answered.
-        queue = {"count": self.success.count, "ns": 0}
         return {
             "name": name,
             "version": str(version),
             "last_inference": self.last_inference,
             "inference_count": self.inference_count,
-            "execution_count": self.infer.count,
+            "execution_count": self.execution_count,
             "inference_stats": {
                 "success": self.success.document(),
                 "fail": self.failure.document(),
-                "queue": queue,
+                "queue": self.queue.document(),
                 "compute_input": self.input.document(),
                 "compute_infer": self.infer.document(),
                 "compute_output": self.output.document(),

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, ObservationError
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_OUT
-from league.policies.open_inference_signature import DATATYPES
+from league.policies.open_inference import DATATYPES
 from league.registry.storage.manifest import PolicyManifest
 from league.spaces import ACTION_MASK, Box, Leaf, inputs
 from league.spaces.arrays import check, check_mask
-from serve_app.codecs.binary_leaves import little_endian
+from league.spaces.binary_leaves import little_endian
 
 _BY_DTYPE = {
     np.dtype(name): datatype for name, datatype in DATATYPES.items()
@@ -142,15 +142,14 @@ def _array(tensor: RequestTensor, port: TensorSpec, max_batch: int) -> NDArray:
     if shape[0] > max_batch:
         raise BodyTooLarge(f"{port.name} has {shape[0]} rows, expected at most {max_batch}")
     if isinstance(tensor.data, bytes | memoryview):
-        return check(port.name, _from_buffer(tensor.data, shape, port), port.leaf)
+        if len(tensor.data) != (size := prod(shape) * np.dtype(port.leaf.dtype).itemsize):
+            raise ObservationError(
+                f"{port.name} has {len(tensor.data)} bytes, expected {size} for {_list(shape)} {port.datatype}"
+            )
+        dtype = np.dtype(port.leaf.dtype).newbyteorder("<")
+        return check(port.name, little_endian(port.name, tensor.data, dtype, "BOOL").reshape(shape), port.leaf)
     read = _from_list if isinstance(tensor.data, list) else _from_field
     return check(port.name, read(tensor.data, shape, port), port.leaf)
-
-
-def _from_buffer(data: bytes | memoryview, shape: tuple[int, ...], port: TensorSpec) -> NDArray:
-    if len(data) != (size := prod(shape) * np.dtype(port.leaf.dtype).itemsize):
-        raise ObservationError(f"{port.name} has {len(data)} bytes, expected {size} for {_list(shape)} {port.datatype}")
-    return little_endian(port.name, data, np.dtype(port.leaf.dtype).newbyteorder("<"), "BOOL").reshape(shape)
 
 
 def _from_field(data: Sequence[Any], shape: tuple[int, ...], port: TensorSpec) -> NDArray:

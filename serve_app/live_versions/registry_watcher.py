@@ -172,7 +172,7 @@ class RegistryWatcher:
 
         Returns whether this one was registered, and the number of replicas that are not being stopped.
         """
-        is_known = registry.replicas.register(self._replica, self._process.description, self._process.is_draining())
+        is_known = registry.replicas.register(self._replica, self._process.described(), self._process.is_draining())
         overdue = OVERDUE_HEARTBEATS * timedelta(seconds=self._settings.heartbeat)
         replicas = registry.replicas.counts(overdue)
         silent = registry.replicas.silent(overdue) if replicas.silent else []

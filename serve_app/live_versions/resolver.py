@@ -42,16 +42,32 @@ class ModelResolver:
         InvalidReference, UnknownLeague, UnknownVersion, VersionRetired, UnknownAlias, UnknownPolicy, ArtifactCorrupt or
         StorageError; NotReady for a league without a champion.
         """
+        if (loaded := self.find_loaded(model, version, headers)) is not None:
+            return loaded
         ref, requested = policy_ref(model), version_of(version)
         if isinstance(requested, int):
-            loaded = self._versions.cached(ref.league, requested) or await self._versions.get(ref.league, requested)
+            return self._acting(await self._versions.get(ref.league, requested), ref, headers)
+        return self._acting(await self._resolve(ref.league, requested), ref, headers, requested == CHAMPION)
+
+    def find_loaded(
+        self, model: str, version: str = CHAMPION, headers: Headers = ()
+    ) -> tuple[LoadedVersion, LoadedPolicy] | None:
+        """Like `find`, but None if the version is not in memory."""
+        ref, requested = policy_ref(model), version_of(version)
+        if isinstance(requested, int):
+            loaded = self._versions.cached(ref.league, requested)
         else:
-            loaded = self._slots.get(ref.league, requested) or await self._resolve(ref.league, requested)
-            if requested == CHAMPION and self._traffic.canaries:
-                loaded = self._traffic.route(loaded, headers)
-        if loaded.mixture is not None:
-            loaded = acting(loaded, headers)
-        return loaded, loaded.policy(ref.policy)
+            loaded = self._slots.get(ref.league, requested)
+        return None if loaded is None else self._acting(loaded, ref, headers, requested == CHAMPION)
+
+    def _acting(
+        self, version: LoadedVersion, ref: PolicyRef, headers: Headers, is_champion: bool = False
+    ) -> tuple[LoadedVersion, LoadedPolicy]:
+        if is_champion and self._traffic.canaries:
+            version = self._traffic.route(version, headers)
+        if version.mixture is not None:
+            version = acting(version, headers)
+        return version, version.policy(ref.policy)
 
     async def members(self, model: str, version: str) -> Collection[int]:
         """The members of a mixture that is named by its number; none of another version or an alias.

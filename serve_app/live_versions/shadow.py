@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 
 from league.errors import GraphTimeout, one_line
 from league.histograms import Histogram
-from league.policies.onnx import OnnxPolicy
-from league.policies.policy import Arrays
+from league.policies.policy import Actions, Arrays
 from league.policies.probes import same
 from league.random.seeds import generators
 from league.registry.storage.rows import ShadowCounts
+from league.search.searched_actions import SearchedActions
 from serve_app.live_versions.alias_slots import AliasSlots
 from serve_app.live_versions.resolver import policy_ref
 from serve_app.live_versions.traffic_split import TrafficSplit, acting
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.version_cache import Graph, LoadedPolicy, LoadedVersion
 from serve_app.runtime.ray_serve import logger
 from serve_app.settings import ServeSettings
 
@@ -82,7 +82,9 @@ class ShadowResult:
     agreed: int = 0
     failed: int = 0
     ns: int | None = None
-    """CPU time of a request that ran alone."""
+    """CPU time of a request that ran alone, of a search that of the search service."""
+    searched_ns: int = 0
+    """CPU time of the search service."""
     fault: str | None = None
     is_late: bool = False
     """Whether a run was ended."""
@@ -217,7 +219,7 @@ def compare(requests: Sequence[MirroredRequest]) -> tuple[list[ShadowResult], fl
             outcomes.append(replace(outcomes[-1], failed=len(later_requests)))
             continue
         outcomes += [_compare_batch(part, is_timed=False) for part in _batches(later_requests)]
-    return outcomes, (thread_time_ns() - start) / 1e9
+    return outcomes, (thread_time_ns() - start + sum(outcome.searched_ns for outcome in outcomes)) / 1e9
 
 
 def _batches(requests: Sequence[MirroredRequest]) -> list[list[MirroredRequest]]:
@@ -240,13 +242,14 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
         observations = {name: np.concatenate([request.observations[name] for request in requests]) for name in names}
         seeds = np.random.default_rng().integers(2**63, size=sum(map(_rows, requests)))
         start = thread_time_ns()
-        actions = _act(candidate, candidate.shadow_policy, observations, seeds)
-        cpu_ns = thread_time_ns() - start
+        answer = _act(candidate, candidate.shadow_policy, observations, seeds)
+        actions, searched_ns = answer.actions, answer.ns if isinstance(answer, SearchedActions) else 0
+        cpu_ns = thread_time_ns() - start + searched_ns
         champion = requests[0].champion.policy(requests[0].policy)
         recorded = [request.actions for request in requests if request.actions is not None]
         # The champion's actions are recomputed if they were or are to be sampled.
         if champion.samples or len(recorded) < len(requests):
-            expected = _act(champion, champion.policy, observations, seeds)
+            expected = _act(champion, champion.policy, observations, seeds).actions
         else:
             expected = np.concatenate(recorded)
         outcome.agreed = int(same(actions, expected, candidate.manifest.action, TOLERANCE).sum())
@@ -254,16 +257,16 @@ def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> Shado
         outcome.is_late = isinstance(error, GraphTimeout)
         outcome.failed, outcome.fault = len(requests), one_line(error, with_type=True)
         return outcome
-    outcome.requests, outcome.observations = len(requests), len(actions)
+    outcome.requests, outcome.observations, outcome.searched_ns = len(requests), len(actions), searched_ns
     outcome.ns = cpu_ns if is_timed else None
     return outcome
 
 
-def _act(policy: LoadedPolicy, graph: OnnxPolicy, observations: Arrays, seeds: NDArray[np.int64]) -> NDArray:
+def _act(policy: LoadedPolicy, graph: Graph, observations: Arrays, seeds: NDArray[np.int64]) -> Actions:
     """Actions as by default. With the same seeds, two policies sample equal actions as often as they are alike."""
     if not policy.samples:
-        return graph.act(observations).actions
-    return graph.act(observations, explore=True, rng=generators(seeds)).actions
+        return graph.act(observations)
+    return graph.act(observations, explore=True, rng=generators(seeds))
 
 
 def _rows(request: MirroredRequest) -> int:

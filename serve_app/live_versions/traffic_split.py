@@ -11,7 +11,7 @@ from random import random
 from typing import NamedTuple
 
 from league.refs import CHAMPION
-from league.registry.storage.mixture import episode_position
+from league.registry.storage.manifest import episode_position
 from league.registry.storage.rows import Portion
 from league.registry.storage.rows import Traffic as Setting
 from serve_app.live_versions.alias_slots import Alias, AliasSlots

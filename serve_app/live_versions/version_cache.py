@@ -5,6 +5,7 @@ import os
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from league.errors import (
     DeadlineExceeded,
     GraphTimeout,
     InvalidInput,
+    NoSearchService,
     Overloaded,
     UnknownPolicy,
     VersionRetired,
@@ -23,12 +25,12 @@ from league.policies.onnx import RUN_TIMEOUT, OnnxPolicy
 from league.policies.policy import Actions, Policy
 from league.policies.probes import Probes
 from league.registry.registry import Registry
-from league.registry.storage.manifest import PolicyManifest
-from league.registry.storage.mixture import Mixture
-from league.registry.storage.rows import VersionState
+from league.registry.storage.manifest import Mixture, PolicyManifest
+from league.registry.storage.rows import VersionRow, VersionState
 from league.spaces import Box, Leaf
-from serve_app.codecs.observation_codec import ObservationReader
+from league.spaces.observation_codec import ObservationReader
 from serve_app.codecs.request_limits import RequestLimits
+from serve_app.live_versions.remote_search import SEARCHES, RemoteSearch, SearchClient
 from serve_app.runtime.background import in_daemon_thread
 
 SHADOW_TIMEOUT = 1.0
@@ -45,12 +47,15 @@ ActionSelections = dict[str, ActionSelection]
 """league → how its versions select actions if a request does not say. All of them share it, so that a change reaches
 all at once."""
 
+Graph = OnnxPolicy | RemoteSearch
+"""What computes the actions of a policy."""
+
 
 @dataclass(slots=True, eq=False, weakref_slot=True)
 class LoadedPolicy:
     """One policy, ready for inference."""
 
-    policy: OnnxPolicy
+    policy: Graph
     manifest: PolicyManifest
     reader: ObservationReader
     state: tuple[tuple[str, Leaf], ...]
@@ -60,26 +65,38 @@ class LoadedPolicy:
     """The largest batch that is fast enough to run on the event loop. 0 after one was not."""
     league: str
     selections: ActionSelections
-    inline_policy: OnnxPolicy = field(init=False)
+    inline_policy: Graph = field(init=False)
     """The same for runs on the event loop."""
-    shadow_policy: OnnxPolicy = field(init=False)
+    shadow_policy: Graph = field(init=False)
     """The same for runs of a shadow, which can be ended."""
     _threads: asyncio.Semaphore = field(init=False)
 
     def __post_init__(self) -> None:
-        self._threads = asyncio.Semaphore(RUNS_IN_THREADS)
+        self._threads = asyncio.Semaphore(SEARCHES if self.search is not None else RUNS_IN_THREADS)
         self.inline_policy = self.policy.within(INLINE_TIMEOUT)
         self.shadow_policy = self.policy.within(SHADOW_TIMEOUT, can_end=True)
 
-    async def run(self, act: Callable[[OnnxPolicy], Actions], rows: int) -> Actions:
+    @property
+    def search(self) -> RemoteSearch | None:
+        """The policy if it searches."""
+        return self.policy if isinstance(self.policy, RemoteSearch) else None
+
+    async def run(self, act: Callable[[Graph], Actions], rows: int) -> Actions:
         """Call `act` with the policy, in a thread if the batch is large. Raises the errors of `act`."""
         if rows <= self.inline_rows:
-            try:
-                return act(self.inline_policy)
-            except GraphTimeout:
-                self.inline_rows = 0
+            with suppress(GraphTimeout):
+                return self.run_inline(act)
         async with self._threads:
-            return await asyncio.to_thread(act, self.policy)
+            threads = None if self.search is None else self.search.threads
+            return await asyncio.get_running_loop().run_in_executor(threads, act, self.policy)
+
+    def run_inline(self, act: Callable[[Graph], Actions]) -> Actions:
+        """Call `act` with the policy on the event loop. Raises the errors of `act`."""
+        try:
+            return act(self.inline_policy)
+        except GraphTimeout:
+            self.inline_rows = 0
+            raise
 
     @property
     def samples(self) -> bool:
@@ -122,13 +139,17 @@ def load(
     inline: float,
     selections: ActionSelections,
     timeout: float = RUN_TIMEOUT,
+    search: SearchClient | None = None,
+    load_timeout: float = RUN_TIMEOUT,
 ) -> LoadedVersion:
     """Load a version, of a mixture without its members. Blocks.
 
     inline: time in seconds that inference may take on the event loop. selections: how it selects actions. timeout: time
-    in seconds after which a run of a graph is ended.
+    in seconds after which a run of a graph, or a search, is ended. search: client of the search service, if there is
+    one. load_timeout: time in seconds until it must have loaded a search version.
 
-    Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError.
+    Raises UnknownLeague, UnknownVersion, VersionRetired, ArtifactCorrupt or StorageError; what the search service
+    raises for a search version, or NoSearchService.
     """
     version = registry.versions.get(league, number)
     if version.retired_at is not None or registry.artifacts.is_purged(league, number):
@@ -139,7 +160,12 @@ def load(
     if version.mixture is not None:
         return LoadedVersion(league, number, version.sha256, {}, version.mixture)
     selections.setdefault(league, registry.leagues.get(league).conditions.actions)
-    policies = {}
+    if version.search is not None:
+        if search is None:
+            raise NoSearchService("this server has no search service: `search_service` is not set in its deploy.yaml")
+        base = registry.versions.get(league, version.search.version)
+        return _load_search(version, base, search, selections, timeout, load_timeout)
+    policies: dict[str, LoadedPolicy] = {}
     for name, manifest in version.manifest.policies.items():
         # Each file is verified as it is read. The others, such as the state of training, can be large.
         graph = registry.artifacts.read(version.manifest, manifest.file)
@@ -154,6 +180,23 @@ def load(
     return LoadedVersion(league, number, version.sha256, policies)
 
 
+def _load_search(
+    version: VersionRow,
+    base: VersionRow,
+    search: SearchClient,
+    selections: ActionSelections,
+    timeout: float,
+    load_timeout: float,
+) -> LoadedVersion:
+    """Let the search service load a version that plays `base`. Its searches never run on the event loop."""
+    policies = {}
+    for name, manifest in base.manifest.policies.items():
+        policy = RemoteSearch(search, version, name, manifest.action, timeout)
+        policy.load(load_timeout)
+        policies[name] = _prepared(policy, manifest, 0, version.league, selections)
+    return LoadedVersion(version.league, version.number, version.sha256, policies)
+
+
 def _warm_up(
     policy: OnnxPolicy, manifest: PolicyManifest, inline: float, league: str, selections: ActionSelections
 ) -> LoadedPolicy:
@@ -162,6 +205,14 @@ def _warm_up(
     one, many = (_measure(policy, reader, rows) for rows in (1, WARM_BATCH))
     per_row = max(many - one, 1e-9) / (WARM_BATCH - 1)
     rows = 0 if one > inline else 1 + int((inline - one) / per_row)
+    return _prepared(policy, manifest, rows, league, selections)
+
+
+def _prepared(
+    policy: Graph, manifest: PolicyManifest, rows: int, league: str, selections: ActionSelections
+) -> LoadedPolicy:
+    """rows: the largest batch that runs on the event loop."""
+    reader = ObservationReader(manifest.observation)
     state = tuple(
         (tensor.name, Box(dtype=tensor.dtype, shape=_sizes(tensor.shape[1:]), low=None, high=None))
         for tensor in manifest.state

@@ -18,6 +18,7 @@ from league.errors import (
     InvalidReference,
     KeyReused,
     LeagueError,
+    NoSearchService,
     NotReady,
     Overloaded,
     RateLimited,
@@ -230,6 +231,7 @@ def _possible(route: Declaration) -> Iterator[type[LeagueError]]:
         yield UnknownLeague
     if "model" in route.path_names:
         yield from (UnknownLeague, UnknownPolicy, UnknownVersion, UnknownAlias, VersionRetired, GraphTimeout)
+        yield NoSearchService
     if route.scope is not None:
         yield from (Unauthenticated, Forbidden, UntrustedHost, Overloaded, RateLimited)
         yield from (NotReady, ArtifactCorrupt, StorageError)

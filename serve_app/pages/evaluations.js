@@ -5,7 +5,7 @@ import { apiPath, request } from "./api.js";
 import { useChangeToken, useData, useList, useMissingScope } from "./data.js";
 import { Await, EmptyState, Form, leaguePath, LongText, Progress, ShowMore, State, Table, Time, useTitle } from "./components.js";
 import { navigate } from "./router.js";
-import { mixture, shortRef } from "./format.js";
+import { mixture, searched, shortRef } from "./format.js";
 
 export function Evaluations({ league }) {
   const evaluations = useList(apiPath(league, "evaluations"), "evaluations", useChangeToken("evaluation", "evaluations"));
@@ -92,8 +92,9 @@ function Tournament({ league, champion, baselines }) {
     </fieldset>`;
 }
 
-/** The role of an exploiter or a mixture as text. */
-function roleOf({ exploits, members }) {
+/** The role of an exploiter, a search version or a mixture as text. */
+function roleOf({ exploits, members, search }) {
+  if (search) return `search with ${searched(search)}`;
   return exploits ? `exploiter of ${shortRef(exploits)}` : members && mixture(members);
 }
 

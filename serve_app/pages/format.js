@@ -33,6 +33,8 @@ export const percent = (share, digits = 1) => {
   return `${share && Number(rounded) === 0 ? (100 * share).toPrecision(2) : rounded} %`;
 };
 
+/** The search of a search version: `@3, 100 simulations, puct, 2.4 ms`. */
+export const searched = ({ version, simulations, rule, ms }) => `@${version}, ${simulations} simulations, ${rule}, ${Number(ms.toPrecision(3))} ms`;
 /** The members of a mixture: `60.0 % @3, 40.0 % @5`. */
 export const mixture = (members) => members.map((each) => `${percent(each.probability)} @${each.version}`).join(", ");
 

@@ -1,11 +1,12 @@
 // The player for recorded games.
 
-import { html, useEffect, useRef, useState } from "./vendor/preact-htm.js";
+import { html, useEffect, useLayoutEffect, useRef, useState } from "./vendor/preact-htm.js";
 import { apiPath, query, request } from "./api.js";
 import { hasOneSide } from "./data.js";
 import { useKeys } from "./keyboard.js";
 import { Await, ErrorNotice, leaguePath, notify, Properties, useTitle } from "./components.js";
-import { describe, Moves, Picture } from "./step.js";
+import { Chart, DataTable } from "./chart.js";
+import { Analyst, describe, Moves, Picture } from "./step.js";
 import { Live, report } from "./report.js";
 import { currentURL, navigate, useAddress } from "./router.js";
 import { number, plural, shortRef } from "./format.js";
@@ -15,7 +16,9 @@ const SPEEDS = [0.5, 1, 2, 4, 8];
 
 export function Game({ league, schedule, position, game, about }) {
   const path = apiPath(league, "matches", schedule, position, "games", game);
-  const [recording, error, loadFrom] = useSteps(path);
+  const [analysis, setAnalysis] = useState(null);
+  const [recording, error, loadFrom] = useSteps(path, analysis);
+  const analyst = html`<${Live}><${Analyst} league=${league} value=${analysis} onChange=${setAnalysis} /><//>`;
   const players = recording && [...new Set(Object.values(recording.players))];
   useTitle(players?.map(shortRef).join(hasOneSide(about) ? " and " : " against "), league);
   return html`<section aria-labelledby="heading">
@@ -23,31 +26,39 @@ export function Game({ league, schedule, position, game, about }) {
     <div class="head"><h2 id="heading">Game ${game}</h2>${recording && !recording.fault && html`<${Live}><${DownloadGif} path=${path} name="${league}-${schedule}-${position}-${game}.gif" /><//>`}</div>
     <${Await} result=${{ data: recording, error, retry: () => loadFrom(0) }} message="Replaying the game …">${recording && (recording.fault
       ? html`<${ErrorNotice} error=${{ message: recording.fault }} />`
-      : html`<${Player} recording=${recording} loadFrom=${loadFrom} />`)}<//>
+      : html`<${Player} recording=${recording} loadFrom=${loadFrom}>${analyst}<//>`)}<//>
+    ${(error || recording?.fault) && analyst}
   </section>`;
 }
 
-/** The steps of a game, loaded in pages: [recording, error, loadFrom(step)]. */
-function useSteps(path) {
+/** The steps of a game, loaded in pages: [recording, error, loadFrom(step)]. `analysis`: number of a search version that evaluates them, or null. */
+function useSteps(path, analysis) {
   const [recording, setRecording] = useState(null);
   const [error, setError] = useState(null);
   const requested = useRef(new Set());
+  const newest = useRef(null);
+  newest.current = analysis;
   const loadFrom = (step = 0) => {
     const from = step - (step % PAGE);
-    if (requested.current.has(from)) return;
-    requested.current.add(from);
-    request(query(path, { from: String(from), to: from + PAGE })).then(
-      (loaded) => { setError(null); setRecording((previous) => ({ ...loaded, steps: { ...previous?.steps, ...byNumber(loaded.steps) } })); },
-      (failure) => { requested.current.delete(from); setError(failure); },
+    const key = `${analysis} ${from}`;
+    if (requested.current.has(key)) return;
+    requested.current.add(key);
+    request(query(path, { from: String(from), to: from + PAGE, analysis })).then(
+      (loaded) => {
+        if (newest.current !== analysis) return;
+        setError(null);
+        setRecording((previous) => ({ ...loaded, steps: { ...previous?.steps, ...byNumber(loaded.steps) } }));
+      },
+      (failure) => { requested.current.delete(key); if (newest.current === analysis) setError(failure); },
     );
   };
-  useEffect(() => loadFrom(0), [path]);
+  useEffect(() => { requested.current.clear(); Object.keys(recording?.steps ?? { 0: null }).filter((step) => step % PAGE === 0).forEach((step) => loadFrom(Number(step))); }, [path, analysis]);
   return [recording, error, loadFrom];
 }
 
 const byNumber = (steps) => Object.fromEntries(steps.map((step) => [step.step, step]));
 
-function Player({ recording, loadFrom }) {
+function Player({ recording, loadFrom, children }) {
   const { fragment } = useAddress();
   const { length: last, every, action_names: names } = recording;
   const clamped = (step) => {
@@ -61,7 +72,9 @@ function Player({ recording, loadFrom }) {
   const step = recording.steps[at];
   const move = (to) => { setIsPlaying(false); setAt(clamped(to)); };
   const toggle = () => { if (!isPlaying && at === last) setAt(0); setIsPlaying(!isPlaying); };
-  useEffect(() => { loadFrom(at); if (at + PAGE / 2 <= last) loadFrom(at + PAGE / 2); written.current = String(at); navigate(`#${at}`, { replace: true }); }, [at]);
+  useEffect(() => { loadFrom(at); if (at + PAGE / 2 <= last) loadFrom(at + PAGE / 2); }, [at]);
+  // A layout effect: an effect would run after the step is visible, and overwrite an address that the user enters before.
+  useLayoutEffect(() => { written.current = String(at); navigate(`#${at}`, { replace: true }); }, [at]);
   useEffect(() => {
     const now = currentURL().hash.slice(1); // `fragment` may be older than what was written
     if (now !== written.current) move(now); // the user has changed the address
@@ -97,10 +110,22 @@ function Player({ recording, loadFrom }) {
       <h3>${step ? (at === 0 ? "Start" : `Step ${at}`) : "Loading …"}${at === last ? " · end" : ""}</h3>
       ${every > 1 && html`<p class="muted small">One in ${every} steps is shown.</p>`}
       <${Moves} step=${step} names=${names} />
+      ${children}
+      <${Values} recording=${recording} />
       <${Players} recording=${recording} isOver=${at === last} />
       <p class="muted small keys"><kbd>Space</kbd> play or pause, <kbd>←</kbd> <kbd>→</kbd> previous or next step, <kbd>Home</kbd> <kbd>End</kbd> first or last step, <kbd>+</kbd> <kbd>−</kbd> speed</p>
     </div>
   </div>`;
+}
+
+/** The returns that a search expects before each move, for the first agent: the other one expects the opposite. */
+function Values({ recording: { steps, players } }) {
+  const [agent] = Object.keys(players);
+  const moves = Object.values(steps).flatMap(({ step, moves: [move] }) => (move?.value == null ? [] : [{ step, value: move.agent === agent ? move.value : -move.value }]));
+  if (moves.length < 2) return null;
+  const chart = { x: moves.map(({ step }) => step), lines: [{ name: `expected return of ${agent}`, values: moves.map(({ value }) => value) }], format: (value) => number(value, 2) };
+  return html`<${Chart} label="Expected return of ${agent} before each move" xName="step" yName="return" height=${160} ...${chart} />
+    <${DataTable} caption="Expected return of ${agent}" xName="step" ...${chart} />`;
 }
 
 function Icon({ path }) {

@@ -8,7 +8,7 @@ import { EarlierResults } from "./earlier.js";
 import { Live } from "./report.js";
 import { Term } from "./term.js";
 import { useAddress } from "./router.js";
-import { count, interval, number, percent, plural, signed } from "./format.js";
+import { count, interval, number, percent, plural, searched, signed } from "./format.js";
 
 export function Leaderboard({ league, about }) {
   const { parameters } = useAddress();
@@ -43,7 +43,8 @@ function Rows({ league, rows, champion, isComputed }) {
   return html`<${Table} caption="Leaderboard" head=${head} cls="full">
     ${rows.map((row, index) => html`<tr key=${row.ref} class=${row.ref === `${league}@${champion}` ? "champion-row" : ""}>
       <td class="number muted">${row.rank ?? index + 1}</td>
-      <th scope="row"><${Ref} value=${row.ref} champion=${champion} /></th>
+      <th scope="row"><${Ref} value=${row.ref} champion=${champion} />
+        ${row.search && html` <span class="muted small">search with ${searched(row.search)}</span>`}</th>
       <td class="number strong">${signed(row.rating)}</td>
       <td class="nowrap muted">${interval(row.interval)}</td>
       <td class="interval-cell"><${IntervalPlot} row=${row} range=${range} /></td>

@@ -6,7 +6,7 @@ import { hasOneSide, useData } from "./data.js";
 import { useKeys } from "./keyboard.js";
 import { Await, Badge, EmptyState, ErrorNotice, sentence } from "./components.js";
 import { navigate, useAddress } from "./router.js";
-import { actionName, describe, Moves, Picture, Probabilities } from "./step.js";
+import { actionName, Analyst, describe, Moves, Picture, Probabilities } from "./step.js";
 import { count, number } from "./format.js";
 
 const SEED_LIMIT = 2 ** 31;
@@ -61,16 +61,17 @@ function NewGame({ league, about, playable }) {
 
 function Game({ league, about, playable, game }) {
   const [showProbabilities, setShowProbabilities] = useState(false);
+  const [analysis, setAnalysis] = useState(null);
   const [state, setState] = useState(null);
   const [error, setError] = useState(null);
   const [answered, setAnswered] = useState(null);
   const [attempt, setAttempt] = useState(0);
   const { opponent, agent, seed, actions } = game;
-  const requestKey = `${actions.join()} ${showProbabilities} ${attempt}`;
+  const requestKey = `${actions.join()} ${showProbabilities} ${analysis} ${attempt}`;
   const busy = answered !== requestKey; // at once: a second click is no second move
   useEffect(() => {
     const closed = new AbortController();
-    request(apiPath(league, "play"), { method: "POST", body: { opponent, agent, seed, actions, chances: showProbabilities }, signal: closed.signal, repeatable: true }).then(
+    request(apiPath(league, "play"), { method: "POST", body: { opponent, agent, seed, actions, chances: showProbabilities, analysis }, signal: closed.signal, repeatable: true }).then(
       (loaded) => { if (!closed.signal.aborted) { setState(loaded); setError(null); setAnswered(requestKey); if (loaded.opponent !== opponent) navigate(fragmentOf({ ...game, opponent: loaded.opponent }), { replace: true }); } },
       (failure) => { if (!closed.signal.aborted) { setError(failure); setAnswered(requestKey); } },
     );
@@ -99,7 +100,9 @@ function Game({ league, about, playable, game }) {
       <p>You are <strong>${agent}</strong> ${isTeam ? "with" : "against"} <strong class="ref">${opponent}</strong> <${Badge}>seed ${seed}<//></p>
       <${Agents} sides=${about.sides} agents=${playable.agents} own=${agent} opponent=${opponent} />
       <label class="option"><input type="checkbox" checked=${showProbabilities} onChange=${(event) => setShowProbabilities(event.target.checked)} /><span>Show the policy's probabilities</span></label>
-      ${showProbabilities && state?.chances?.length > 0 && !state.over && html`<h3>Policy's probabilities in your position</h3><${Probabilities} values=${state.chances} names=${names[agent]} />`}
+      <${Analyst} league=${league} value=${analysis} onChange=${setAnalysis} />
+      ${state?.chances?.length > 0 && !state.over && html`<h3>${analysis == null ? "Policy's probabilities in your position" : `Best move: ${actionName(names[agent], state.chances[0][0])}`}</h3>
+        ${state.value != null && html`<p class="muted small">expected return ${number(state.value, 2)}</p>`}<${Probabilities} values=${state.chances} names=${names[agent]} />`}
       ${state && html`<${MoveLog} steps=${state.steps} names=${names} showProbabilities=${showProbabilities} />`}
       <div class="buttons">
         <button type="button" class=${state?.over ? "primary" : ""} onClick=${restart}>Play again</button>

@@ -8,7 +8,7 @@ import { EditNote, Note } from "./note.js";
 import { Await, Badge, EmptyState, Ref, ShowMore, Table, Time } from "./components.js";
 import { canBePromoted, Promote } from "./promotion.js";
 import { Live } from "./report.js";
-import { count, interval, mixture, plural, short, signed } from "./format.js";
+import { count, interval, mixture, plural, searched, short, signed } from "./format.js";
 
 export function Versions({ league, about }) {
   const [promoting, setPromoting] = useState(null);
@@ -55,6 +55,7 @@ function Row({ league, version: each, rated, champion, promote, edit, disabledRe
     <th scope="row"><${Ref} value="${league}@${each.version}" champion=${champion} />${others.map((alias) => html` <${Badge}>${alias}<//>`)}
       ${each.exploits && html` <${Badge}>exploiter of ${each.exploits}<//>`}
       ${each.retired_at && html` <${Badge}>retired<//>`}
+      ${each.search && html` <span class="muted small">search with ${searched(each.search)}</span>`}
       ${each.members && html` <span class="muted small">${mixture(each.members)}</span>`}</th>
     <td class="number strong">${signed(rated?.rating)}</td>
     <td class="nowrap muted">${interval(rated?.interval)}</td>

@@ -1,6 +1,7 @@
 """POST /v1/policies/{model}/action: observations to actions, the hot path.
 
-    request   {"observation": …}  or  {"observations": [ … ]};  optional "state", "explore", "seed", "probabilities"
+    request   {"observation": …}  or  {"observations": [ … ]};  optional "state", "explore", "seed", "probabilities",
+                                                                  "deadline_ms", "analysis"
     response  {"action": …}       or  {"actions": [ … ]};       with "model", "version", "sha256" and requested fields
 
 `seed` is an integer, or a list with one per observation. With a seed of its own an observation gets the same action in

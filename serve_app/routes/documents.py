@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from league.conditions import ActionSelection
 from league.refs import MAX_VERSION
+from league.registry.storage.manifest import SearchRule
 from league.registry.storage.rows import EvaluationState, VerdictRow
 from serve_app.declaration import NUMBER_OR_ALIAS, Response
 
@@ -52,6 +53,17 @@ class MixtureMember(Response):
 
     version: Number
     probability: float = Field(gt=0, le=1)
+
+
+class VersionSearch(Response):
+    """The search of a version that plays another one."""
+
+    version: Number = Field(description="The version that evaluates positions.")
+    rule: SearchRule
+    simulations: int = Field(description="Positions that each decision evaluates besides the current one.")
+    ms: float = Field(
+        description="Milliseconds of a search from the initial position, on the machine that published the version."
+    )
 
 
 class EvaluationProgress(StoredDocument):

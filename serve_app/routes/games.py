@@ -13,18 +13,22 @@ from league.errors import (
     GameCrashed,
     GameHung,
     IllegalAction,
+    InvalidInput,
     NoEvaluationService,
     RemoteError,
     UnknownAlias,
     UnknownMatch,
     UnknownPolicy,
     UnknownVersion,
+    VersionRetired,
     WorkerLost,
 )
 from league.policies.loading import requested
+from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.service_requests import (
+    MOST_ANALYSED,
     MOST_NUMBER,
     GameOperation,
     GameRequest,
@@ -68,8 +72,14 @@ class GameRoutes:
             ),
             integer("to", "The end of the range (exclusive).", smallest=0, largest=MOST_NUMBER, argument="end"),
             integer("every", "The distance between two steps.", largest=MOST_NUMBER, default=1),
+            integer(
+                "analysis",
+                "A search version that evaluates the positions: `chances` are its probabilities, and `value` is the"
+                " return that it expects for the agent.",
+                largest=MOST_NUMBER,
+            ),
         ),
-        errors=(UnknownMatch, *OF_GAMES),
+        errors=(UnknownMatch, UnknownVersion, VersionRetired, EnvironmentMismatch, *OF_GAMES),
         scope="read",
         tag="Games",
     )
@@ -83,6 +93,7 @@ class GameRoutes:
         first: int,
         end: int | None,
         every: int,
+        analysis: int | None,
     ) -> Response:
         """Get the steps of a recorded game.
 
@@ -91,7 +102,7 @@ class GameRoutes:
         range.
         """
         match = f"{schedule}/{position}"
-        operation = RecordingRequest(match=match, game=game, first=first, end=end, every=every)
+        operation = RecordingRequest(match=match, game=game, first=first, end=end, every=every, analysis=analysis)
         return _response(await self._of_match(league, operation))
 
     @Declaration(
@@ -135,6 +146,7 @@ class GameRoutes:
         body=PlayBody,
         errors=(
             UnknownVersion,
+            VersionRetired,
             UnknownAlias,
             UnknownPolicy,
             EnvironmentMismatch,
@@ -156,6 +168,7 @@ class GameRoutes:
         """
 
         def build_operation(registry: Registry) -> HumanPlayRequest:
+            _check_analysis(registry, league, body.analysis)
             return HumanPlayRequest(**body.model_dump() | {"opponent": requested(body.opponent, league, registry)})
 
         return _response(await self._request_game(league, build_operation))
@@ -167,6 +180,8 @@ class GameRoutes:
             record = Ledger(registry).match(operation.match)
             if record.league != league or operation.game >= len(record.games):
                 raise UnknownMatch(f"league {league} has no game {operation.game} of match {operation.match}")
+            if isinstance(operation, RecordingRequest):
+                _check_analysis(registry, league, operation.analysis)
             return operation
 
         return await self._request_game(league, check)
@@ -180,6 +195,19 @@ class GameRoutes:
 
         game_request = await self._models.in_registry_thread(build_request)
         return await require_client(self._evaluation_client).request_game(game_request)
+
+
+def _check_analysis(registry: Registry, league: str, number: int | None) -> None:
+    """Raise UnknownVersion, VersionRetired, or InvalidInput unless the version has a search that is short enough."""
+    if number is None:
+        return
+    search = registry.versions.with_files(CheckpointRef(league, number)).search
+    if search is None:
+        raise InvalidInput(f"analysis: {league}@{number} does not search: name a search version")
+    if search.simulations > MOST_ANALYSED:
+        raise InvalidInput(
+            f"analysis: {league}@{number} has {search.simulations} simulations, expected at most {MOST_ANALYSED}"
+        )
 
 
 def _response(game: GameResponse, headers: dict[str, str] | None = None) -> Response:

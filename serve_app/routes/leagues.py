@@ -30,6 +30,7 @@ from serve_app.routes.documents import (
     StoredTime,
     TrafficSetting,
     VerdictDecision,
+    VersionSearch,
 )
 
 NO_REQUESTS = RequestCounts()
@@ -178,11 +179,13 @@ class ListedVersion(Response):
     aliases: list[str]
     sha256: Digest
     parent: int | None
-    role: Literal["main", "exploiter", "mixture"] = Field(
-        description="An exploiter cannot become champion. A mixture has members, one of which plays each episode."
+    role: Literal["main", "exploiter", "mixture", "search"] = Field(
+        description="An exploiter cannot become champion. A mixture has members, one of which plays each episode. A"
+        " search version plays another version with a search."
     )
     exploits: str | None = Field(description="The version that an exploiter was trained against.")
     members: Members | None = Field(default=None, validation_alias=AliasPath("mixture", "members"))
+    search: VersionSearch | None = Field(description="The search of a search version.")
     steps: int = Field(description="Number of environment steps of training.")
     algorithm: str = Field(validation_alias=AliasPath("manifest", "algorithm"))
     policies: Annotated[list[str], BeforeValidator(list)] = Field(validation_alias=AliasPath("manifest", "policies"))

@@ -18,7 +18,7 @@ from league.results import records
 from league.results.ledger import Ledger
 from league.service_requests import GameForfeit
 from serve_app.declaration import Declaration, Page, Response, integer, text
-from serve_app.routes.documents import ComputedAt, Interval, Number, StoredDocument, StoredTime
+from serve_app.routes.documents import ComputedAt, Interval, Number, StoredDocument, StoredTime, VersionSearch
 
 GAME = text(
     "game",
@@ -84,6 +84,7 @@ class LeaderboardRow(StoredDocument):
     mean_return: float | None
     games: int
     unique_games: int | None
+    search: VersionSearch | None = Field(description="The search of a search version.")
 
 
 class Leaderboard(Response):
@@ -231,7 +232,13 @@ def leaderboard(
         )
         raise InvalidInput(f"{expected}, got {side!r}")
     every = document["leaderboard"] if side is None else document["by_side"][side]
-    page = [{"rank": offset + place} | standing for place, standing in enumerate(every[offset : offset + limit], 1)]
+    standings, prefix = every[offset : offset + limit], f"{league}@"
+    numbers = [int(row["ref"].removeprefix(prefix)) for row in standings if row["ref"].startswith(prefix)]
+    searches = {f"{prefix}{number}": search for number, search in registry.versions.searches(league, numbers).items()}
+    page = [
+        {"rank": offset + place, "search": searches.get(standing["ref"])} | standing
+        for place, standing in enumerate(standings, 1)
+    ]
     return {
         "league": league,
         "computed_at": computed_at,

@@ -21,12 +21,13 @@ from starlette.types import Receive, Scope, Send
 
 from league.errors import InvalidInput, Unauthenticated, one_line
 from league.refs import CHAMPION, check_alias
-from serve_app.access.access_control import KEY, POLICY_VIOLATION
+from serve_app.access.access_control import KEY, POLICY_VIOLATION, SUBPROTOCOL
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.connection_limit import ConnectionLimit, within_descriptors
 from serve_app.declaration import ALIAS, CALLER, REPLICA_HEADER, VERSION, Declaration, Parameter
 from serve_app.inference.action_request import REPLICA
-from serve_app.inference.stream_session import StreamDependencies, StreamSession
+from serve_app.inference.stream_batches import StreamBatches
+from serve_app.inference.stream_session import InferenceDependencies, StreamSession
 from serve_app.live_versions.resolver import policy_ref, version_of
 from serve_app.routes.query_string import query_params
 from serve_app.runtime.background import in_background
@@ -83,7 +84,7 @@ class StreamRoute:
     """The endpoint as a plain ASGI application. is_draining: whether this replica is being stopped."""
 
     def __init__(
-        self, dependencies: StreamDependencies, replica: str, is_draining: Callable[[], bool] = lambda: False
+        self, dependencies: InferenceDependencies, replica: str, is_draining: Callable[[], bool] = lambda: False
     ) -> None:
         self._dependencies = dependencies
         self._replica = replica
@@ -97,6 +98,7 @@ class StreamRoute:
                 limit,
             )
         self.connections = ConnectionLimit("streams", limit, settings.max_streams_per_key)
+        self._batches = StreamBatches()
         self._accepted: set[OpenStream] = set()
         self._closings: dict[OpenStream, asyncio.TimerHandle] = {}
         self._replicas: int | None = None
@@ -120,8 +122,9 @@ class StreamRoute:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Open a WebSocket for inference.
 
-        A WebSocket (RFC 6455, no subprotocol, no compression) for game servers and robots. Each message gets exactly
-        one response, in order. The connection keeps the recurrent state.
+        A WebSocket (RFC 6455, no compression) for game servers and robots. Each message gets exactly one response, in
+        order. The connection keeps the recurrent state. A page in a browser, which cannot set headers, offers the
+        subprotocols `policy-league` and `policy-league.key.plk_…` with its API key; the server selects the first.
 
         The stream is pinned to `version`, or to the version that `champion` names when it is opened. With
         `follow={alias}` each message is served by the version that the alias names at that time; a recurrent policy
@@ -139,7 +142,8 @@ class StreamRoute:
         await receive()  # the handshake
         with self.connections.opened(scope.get(KEY)):
             stream, headers = await self._create_session(scope)
-            await send({"type": "websocket.accept", "headers": headers})
+            subprotocol = SUBPROTOCOL if SUBPROTOCOL in scope["subprotocols"] else None
+            await send({"type": "websocket.accept", "subprotocol": subprotocol, "headers": headers})
             opened = OpenStream(scope.get(KEY), send, scope.get("extensions", {}).get(STREAM_PROTOCOL))
             self._accepted.add(opened)
             try:
@@ -214,7 +218,16 @@ class StreamRoute:
             version = next((member for member in members if member.number == number), version)
             policy = version.policy(ref.policy)
         headers = {b"x-league-version": str(version.number), b"x-league-sha256": version.sha256, REPLICA: self._replica}
-        stream = StreamSession(self._dependencies, model, (version, policy), follows, scope["headers"], scope.get(KEY))
+        can_wait = STREAM_PROTOCOL in scope.get("extensions", {})
+        stream = StreamSession(
+            self._dependencies,
+            model,
+            (version, policy),
+            follows,
+            scope["headers"],
+            scope.get(KEY),
+            self._batches if can_wait else None,
+        )
         return stream, [(name, value.encode()) for name, value in headers.items()]
 
     async def _exchange_messages(self, stream: StreamSession, opened: OpenStream, receive: Receive) -> None:

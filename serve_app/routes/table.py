@@ -8,6 +8,7 @@ from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.events import EventRoutes
 from serve_app.routes.games import GameRoutes
 from serve_app.routes.pages import DocsRoutes, PageRoutes
+from serve_app.routes.simulate import SimulateRoute
 from serve_app.routes.status import StatusRoutes
 from serve_app.routes.stream import StreamRoute
 from serve_app.routes.traffic import TrafficRoutes
@@ -15,7 +16,7 @@ from serve_app.routes.traffic import TrafficRoutes
 OF_REGISTRY = (leagues, results, verdicts, runs, nights, aliases, traffic, evaluations)
 """Modules with routes that need the registry only."""
 OWNERS = (
-    *(ActionRoute, StreamRoute, InferRoute, RestRoutes),
+    *(ActionRoute, StreamRoute, SimulateRoute, InferRoute, RestRoutes),
     *OF_REGISTRY,
     *(TrafficRoutes, EvaluationRoutes, EventRoutes, GameRoutes, StatusRoutes, DocsRoutes, PageRoutes),
 )

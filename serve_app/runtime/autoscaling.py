@@ -1,6 +1,6 @@
 """Decides how many replicas a load needs.
 
-Ray Serve runs `LoadPolicy`, which deploy.yaml names, in its controller, ten times a second. Replicas report their load
+Ray Serve runs `LoadPolicy`, which deploy.yaml names, at each turn of its controller's loop. Replicas report their load
 (serve_app.observability.load), since Serve's own statistics do not contain requests that bypass it. Bounds and delays
 are those of `autoscaling_config`. Serve copies this module to the controller by value: it imports only the standard
 library.

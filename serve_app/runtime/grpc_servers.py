@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import grpc
 
-WORKER_HOOK = "__RAY_WORKER_PROCESS_SETUP_HOOK_ENV_VAR"
-"""Ray's environment variable for a function that each process of a worker calls first, by its import path."""
 ALL_INTERFACES, LOOPBACK = "[::]:", "127.0.0.1:"
 API_SERVICE = "/ray.serve.RayServeAPIService/"
 """The service of Ray Serve on the same servers: its health, and the names of applications."""
@@ -28,7 +26,7 @@ OPTIONS = (
 
 
 def listen_on_loopback() -> None:
-    """Let the gRPC servers of this process listen on the loopback interface: the WORKER_HOOK of a local server."""
+    """Let the gRPC servers of this process listen on the loopback interface."""
     from grpc.aio._server import Server
 
     original = Server.add_insecure_port

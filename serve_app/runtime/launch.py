@@ -34,8 +34,11 @@ from serve_app.runtime.autoscaling import LoadPolicy
 from serve_app.runtime.starting_page import starting_page
 from serve_app.settings import ServeSettings, is_exposed
 
+OnReady = Callable[[str, Path, str | None], None]
+"""Called with the base URL (`http://127.0.0.1:8000`), the directory of Ray's logs on this machine, and the URL of the
+dashboard, if there is one."""
 DEPLOY_YAML = Path(__file__).parent.parent / "deploy.yaml"
-START_TIMEOUT = 180.0
+START_TIMEOUT = 300.0
 """Seconds for Ray and the replicas to start."""
 OBJECT_STORE = 105
 """Size of Ray's object store in MB; serving hardly uses it."""
@@ -54,8 +57,9 @@ def serve_forever(
     insecure: bool = False,
     root_path: str | None = None,
     address: str | None = None,
+    dashboard: bool = False,
     deploy: Path = DEPLOY_YAML,
-    on_ready: Callable[[str, Path], None] | None = None,
+    on_ready: OnReady | None = None,
 ) -> None:
     """Serve the leagues of `storage` until SIGINT or SIGTERM, then shut down. Prints nothing.
 
@@ -72,9 +76,9 @@ def serve_forever(
         root_path: The path below which a proxy serves the server; None for that of `deploy`.
         address: A running Ray cluster to serve on, whose nodes have the environment that deploy.yaml lists, as has this
             process. None starts a Ray on the loopback interface.
+        dashboard: Whether to start the dashboard of that Ray, and the agents that report to it.
         deploy: The deploy.yaml.
-        on_ready: Called once when every replica answers, with the base URL (`http://127.0.0.1:8000`) and the directory
-            of Ray's logs on this machine.
+        on_ready: Called once when every replica answers.
 
     Raises:
         ConfigError: deploy.yaml is invalid, the cluster is unreachable or cannot reach the storage, or other machines
@@ -91,7 +95,7 @@ def serve_forever(
     try:
         with _signals_interrupt():
             if address is None:
-                _serve_locally(document, on_ready)
+                _serve_locally(document, dashboard, on_ready)
             else:
                 _serve_on_cluster(address, storage, document, on_ready)
     except KeyboardInterrupt:
@@ -109,6 +113,7 @@ def running(
     max_replicas: int | None = None,
     insecure: bool = False,
     root_path: str | None = None,
+    dashboard: bool = False,
     deploy: Path = DEPLOY_YAML,
     timeout: float = START_TIMEOUT,
 ) -> Iterator[str]:
@@ -123,6 +128,7 @@ def running(
         max_replicas: As for `serve_forever`.
         insecure: Accept requests without an API key.
         root_path: As for `serve_forever`.
+        dashboard: As for `serve_forever`.
         deploy: The deploy.yaml.
         timeout: Seconds until every replica must answer.
 
@@ -144,6 +150,7 @@ def running(
         "max_replicas": max_replicas,
         "insecure": insecure,
         "root_path": root_path,
+        "dashboard": dashboard,
     }
     order = json.dumps({"deploy": str(deploy), "arguments": arguments})
     with tempfile.TemporaryFile() as log:
@@ -210,6 +217,14 @@ def _set_replicas(deployment: dict[str, Any], replicas: int | None, max_replicas
             raise ConfigError(f"deploy.yaml: policy_kwargs: {one_line(error)}") from error
 
 
+def _omit_statistics(deployment: dict[str, Any]) -> None:
+    """Make equal bounds of the number of replicas a fixed number, for which replicas report nothing to Ray."""
+    bounds = deployment.get("autoscaling_config")
+    if bounds is not None and (number := bounds.get("min_replicas", 1)) == bounds.get("max_replicas", 1):
+        del deployment["autoscaling_config"]
+        deployment["num_replicas"] = number
+
+
 def _settings(document: dict[str, Any]) -> ServeSettings:
     """The settings of the replicas. Raises ConfigError."""
     try:
@@ -234,7 +249,7 @@ def _check_exposure(document: dict[str, Any], storage: Storage) -> None:
         )
 
 
-def _serve_locally(document: dict[str, Any], on_ready: Callable[[str, Path], None] | None) -> None:
+def _serve_locally(document: dict[str, Any], dashboard: bool, on_ready: OnReady | None) -> None:
     """Serve on a local Ray."""
     host, port = document["http_options"]["host"], document["http_options"]["port"]
     grpc = document.get("grpc_options", {})
@@ -253,16 +268,18 @@ def _serve_locally(document: dict[str, Any], on_ready: Callable[[str, Path], Non
         ray_serve.check_haproxy()
         with ray_session(), _errors_of_ray():
             try:
-                resources = LocalRay(cpus=max(2, usable_cpus()), object_store=OBJECT_STORE)
-                start_local(resources, namespace="serve")
-                _deploy(document, on_ready)
+                has_tasks = _settings(document).evaluation_workers > 1  # those of evaluation.service.evaluation_job
+                cpus = max(2, usable_cpus())
+                resources = LocalRay(cpus, OBJECT_STORE, dashboard, runtime_envs=has_tasks)
+                if not dashboard:
+                    _omit_statistics(document["applications"][0]["deployments"][0])
+                url = start_local(resources, namespace="serve")
+                _deploy(document, on_ready, url)
             finally:
                 haproxy.stop(directory)  # before Ray: it stops accepting requests and finishes those in progress
 
 
-def _serve_on_cluster(
-    address: str, storage: Storage, document: dict[str, Any], on_ready: Callable[[str, Path], None] | None
-) -> None:
+def _serve_on_cluster(address: str, storage: Storage, document: dict[str, Any], on_ready: OnReady | None) -> None:
     """Serve on a running cluster."""
     from ray import serve
 
@@ -270,19 +287,19 @@ def _serve_on_cluster(
     (application,) = document["applications"]
     application["runtime_env"] = {"env_vars": storage.environment}
     with ray_session(), _errors_of_ray():
-        join(address, namespace="serve")
+        url = join(address, namespace="serve")
         nodes = node_addresses()
         storage.check_reach(nodes)
         check_stacks()
         if len(nodes) > 1:  # HAProxy of each node calls all replicas
             application["args"] = {"grpc_local_only": False} | application.get("args", {})
         try:
-            _deploy(document, on_ready)
+            _deploy(document, on_ready, url)
         finally:
             serve.delete(application["name"])
 
 
-def _deploy(document: dict[str, Any], on_ready: Callable[[str, Path], None] | None) -> NoReturn:
+def _deploy(document: dict[str, Any], on_ready: OnReady | None, dashboard: str | None) -> NoReturn:
     """Deploy, and wait for a signal, which raises KeyboardInterrupt."""
     from ray.serve.schema import ServeDeploySchema
 
@@ -297,7 +314,7 @@ def _deploy(document: dict[str, Any], on_ready: Callable[[str, Path], None] | No
     (application,) = schema.applications
     _await_replicas(application.name, application.deployments[0].name, url.replace("0.0.0.0", "127.0.0.1"))
     if on_ready is not None:
-        on_ready(url, ray_serve.log_directory())
+        on_ready(url, ray_serve.log_directory(), f"http://{dashboard}" if dashboard else None)
     while True:
         signal.pause()
 
@@ -384,7 +401,7 @@ def main() -> None:
         serve_forever(
             Storage.from_environment(),
             deploy=Path(order["deploy"]),
-            on_ready=lambda url, _: print(json.dumps({"url": url}), file=announce),
+            on_ready=lambda url, *_: print(json.dumps({"url": url}), file=announce),
             **order["arguments"],
         )
     except LeagueError as error:

@@ -6,12 +6,13 @@ checks that the upstream code is still as it is used here.
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from league.errors import NotReady
-from serve_app.runtime.replica_process import ReplicaProcess, this_process
+from serve_app.runtime.replica_process import LOOPBACK, ReplicaProcess, this_process
+from serve_app.runtime.worker_start import import_serve
 from serve_app.settings import is_exposed
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ logger = logging.getLogger("ray.serve.policy_league")
 logger.setLevel(logging.INFO)
 
 
+ALL_INTERFACES = ("0.0.0.0", "::")
 RUNNING_REQUESTS = "running_requests"
 """Ray Serve's statistic of requests in progress in a replica. One that the replica records takes its place."""
 
@@ -47,10 +49,24 @@ def replica_id() -> str:
 
 def is_draining() -> bool:
     """Whether Ray Serve stops the replica in this process, and HAProxy sends it no new requests."""
+    return any(getattr(replica, "_shutting_down", False) for replica in _replicas())
+
+
+def own_url(host: str) -> str:
+    """The URL of the HTTP port of the replica in this process, for programs of its machine; empty until it listens.
+
+    host: on which it listens.
+    """
+    port = next((port for replica in _replicas() if (port := getattr(replica, "_http_port", None))), None)
+    return "" if port is None else f"http://{LOOPBACK if host in ALL_INTERFACES else host}:{port}"
+
+
+def _replicas() -> Iterator[Any]:
+    """The objects with which Ray Serve runs a replica: one if this process has a replica."""
     from ray._private.worker import global_worker
 
-    replicas = (getattr(actor, "_replica_impl", None) for actor in global_worker.actors.values())
-    return any(getattr(replica, "_shutting_down", False) for replica in replicas)
+    for actor in global_worker.actors.values():
+        yield getattr(actor, "_replica_impl", None)
 
 
 def load_proxy_classes_from_installed_code() -> None:
@@ -81,14 +97,15 @@ def replica_process() -> ReplicaProcess:
     """The process of this replica, known by its machine and as an actor of its Ray cluster."""
     import ray
 
-    process, context = this_process(), ray.get_runtime_context()
+    process, context, host = this_process(), ray.get_runtime_context(), listening_host()
     actor = {"node": context.get_node_id(), "actor": context.get_actor_name() or ""}
     return ReplicaProcess(
         {**process.description, **actor},
         lambda other: process.has_ended(other) or _actor_has_ended(other, context.namespace),
         node_address(),
-        is_exposed(listening_host()),
+        is_exposed(host),
         is_draining,
+        lambda: own_url(host),
     )
 
 
@@ -142,6 +159,7 @@ def deploy(schema: "ServeDeploySchema") -> None:
 
 def check_haproxy() -> None:
     """Raise NotReady unless Ray finds the HAProxy binary."""
+    import_serve()
     from ray.serve._private.haproxy import get_haproxy_binary
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)  # it logs the path of the binary

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from league.registry import processes
-from league.registry.replicas import PROCESS
+from league.registry.replicas import PROCESS, URL
 
 LOOPBACK = "127.0.0.1"
 
@@ -23,6 +23,7 @@ class ReplicaProcess:
         address: Address of its machine.
         is_exposed: Whether other machines reach it.
         is_draining: Returns whether it is being stopped.
+        url: Returns the URL at which programs of its machine reach it without HAProxy; empty until it listens.
     """
 
     description: Mapping[str, str]
@@ -30,6 +31,12 @@ class ReplicaProcess:
     address: str = LOOPBACK
     is_exposed: bool = False
     is_draining: Callable[[], bool] = lambda: False
+    url: Callable[[], str] = lambda: ""
+
+    def described(self) -> dict[str, str]:
+        """The description, with the URL if there is one."""
+        url = self.url()
+        return dict(self.description) | ({URL: url} if url else {})
 
 
 def this_process() -> ReplicaProcess:

@@ -9,9 +9,12 @@ HAProxy limits the connections of its clients. Clients that connect to the port 
 and must send a request soon. While many connections are open, each of them is closed after its response.
 
 A server that stops finishes requests in progress. Event streams are notified so that they end.
+
+Requests that PlainRequests takes, and that arrive in one piece, are answered without a task and an ASGI application.
 """
 
 import asyncio
+import logging
 import os
 import resource
 import socket
@@ -22,12 +25,12 @@ from contextlib import suppress
 from functools import lru_cache, partial
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 from weakref import WeakKeyDictionary
 
 from uvicorn.config import Config
 from uvicorn.protocols.http import auto
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
 
 from serve_app.runtime.joined_writes import JoinedWrites
@@ -111,6 +114,17 @@ def _is_loopback(address: str) -> bool:
     return ip_address(address).is_loopback
 
 
+_lines: tuple[list[tuple[bytes, bytes]], bytes] = [], b""
+"""The default headers of the last response, and their lines. uvicorn replaces the list every second."""
+
+
+def _header_lines(headers: list[tuple[bytes, bytes]]) -> bytes:
+    global _lines
+    if _lines[0] is not headers:
+        _lines = headers, b"".join(b"%b: %b\r\n" % header for header in headers)
+    return _lines[1]
+
+
 NO_HTTP = b'{"code": "invalid_input", "message": "the request is not valid HTTP"}'
 MALFORMED = (
     b"HTTP/1.1 400 Bad Request\r\ncontent-type: application/json\r\nx-content-type-options: nosniff\r\n"
@@ -119,12 +133,25 @@ MALFORMED = (
 """The response to bytes that are not HTTP."""
 
 
-def install(when_stopping: Callable[[], None]) -> None:
+class PlainRequests(Protocol):
+    """What answers simple requests, all of those that arrive in one turn of the event loop together."""
+
+    def takes(self, url: bytes, headers: list[tuple[bytes, bytes]]) -> bool:
+        """Whether it may answer a POST with these headers. Called before the body arrives."""
+
+    def add(self, connection: "HttpProtocol") -> None:
+        """Answer the request of a connection in this turn or a later one: call its `answer` or `pass_on`."""
+
+    def flush(self) -> None:
+        """Answer all added requests now."""
+
+
+def install(when_stopping: Callable[[], None], plain: PlainRequests | None = None) -> None:
     """Make this the default HTTP protocol of uvicorn servers in this process, including Ray Serve's.
 
-    when_stopping: called for each open connection when the server stops.
+    when_stopping: called for each open connection when the server stops. plain: answers simple requests.
     """
-    auto.AutoHTTPProtocol = partial(HttpProtocol, when_stopping)  # type: ignore[assignment]
+    auto.AutoHTTPProtocol = partial(HttpProtocol, when_stopping, plain)  # type: ignore[assignment]
 
 
 class HttpProtocol(HttpToolsProtocol):
@@ -133,6 +160,7 @@ class HttpProtocol(HttpToolsProtocol):
     def __init__(
         self,
         when_stopping: Callable[[], None],
+        plain: PlainRequests | None,
         config: Config,
         server_state: ServerState,
         app_state: dict[str, Any],
@@ -140,6 +168,15 @@ class HttpProtocol(HttpToolsProtocol):
     ) -> None:
         super().__init__(config, server_state, app_state, _loop)
         self._when_stopping = when_stopping
+        # The general path sends 503 beyond `limit_concurrency`, and writes uvicorn's access log.
+        is_logged = self.access_log and self.access_logger.isEnabledFor(logging.INFO)
+        self._plain = None if is_logged or self.root_path or self.limit_concurrency is not None else plain
+        self._is_held = False
+        """Whether the body of a plain request is arriving."""
+        self.is_waiting = False
+        """Whether a plain request is to be answered."""
+        self.body = b""
+        """That of a plain request."""
         self._address = ""
         """The address of a client on another machine, as long as its connection counts."""
         self._first_request: asyncio.TimerHandle | None = None
@@ -147,6 +184,7 @@ class HttpProtocol(HttpToolsProtocol):
 
     def shutdown(self) -> None:
         """Finish the request in progress."""
+        self._flush_plain()
         super().shutdown()
         self._when_stopping()
 
@@ -166,7 +204,13 @@ class HttpProtocol(HttpToolsProtocol):
             queue = _queues[self.server_state] = AcceptQueue(self.server[1])
         while (connection := queue.take()) is not None:
             protocol = partial(
-                HttpProtocol, self._when_stopping, self.config, self.server_state, self.app_state, self.loop
+                HttpProtocol,
+                self._when_stopping,
+                self._plain,
+                self.config,
+                self.server_state,
+                self.app_state,
+                self.loop,
             )
             task = self.loop.create_task(self.loop.connect_accepted_socket(protocol, connection))
             self.server_state.tasks.add(task)  # type: ignore[arg-type]
@@ -181,14 +225,87 @@ class HttpProtocol(HttpToolsProtocol):
         self._unset_keepalive_if_required()
         self._release()
 
+    def data_received(self, data: bytes) -> None:
+        """Parse bytes of requests."""
+        super().data_received(data)
+        if self._is_held:  # the rest of the body arrives later
+            self._is_held = False
+            if not self.transport.is_closing():
+                self._start()
+
+    def on_message_begin(self) -> None:
+        """Prepare for a request."""
+        self._flush_plain()  # a pipelined request is answered after the one before
+        super().on_message_begin()
+
     def on_headers_complete(self) -> None:
-        """Start the request."""
-        super().on_headers_complete()
-        if not self.cycle:  # an upgrade
-            return
+        """Start the request, or hold it until its body is complete."""
         if self._first_request is not None:
             self._first_request.cancel()
             self._first_request = None
+        if (
+            self._plain is not None
+            and self.parser.get_method() == b"POST"
+            and self._plain.takes(self.url, self.headers)
+            and (self.cycle is None or self.cycle.response_complete)
+            and self.parser.get_http_version() == "1.1"
+            and self.parser.should_keep_alive()
+            and not self.parser.should_upgrade()
+            and not self.flow.write_paused
+            and len(self.connections) <= self._crowd
+        ):
+            self._is_held, self.body = True, b""
+        else:
+            self._begin()
+
+    def on_body(self, body: bytes) -> None:
+        """Receive a part of the body."""
+        if self._is_held:
+            self.body += body
+        else:
+            super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        """Complete the request."""
+        if self._is_held:
+            assert self._plain is not None
+            self._is_held, self.is_waiting = False, True
+            self.scope["method"] = "POST"
+            self._plain.add(self)
+        else:
+            super().on_message_complete()
+
+    def answer(self, status: int, head: bytes, body: bytes) -> None:
+        """Send the response to a plain request. head: its header lines and an empty line."""
+        self.is_waiting, self.body = False, b""
+        if not self.transport.is_closing():
+            self._joined.flush()
+            default = _header_lines(self.server_state.default_headers)
+            self._joined.transport.write(b"".join((STATUS_LINE[status], default, head, body)))
+            super().on_response_complete()
+
+    def pass_on(self) -> None:
+        """Let the application answer a plain request."""
+        self.is_waiting = False
+        if not self.transport.is_closing():
+            self._start()
+            super().on_message_complete()
+
+    def _flush_plain(self) -> None:
+        if self.is_waiting:
+            assert self._plain is not None
+            self._plain.flush()
+
+    def _start(self) -> None:
+        body, self.body = self.body, b""  # an idle connection keeps none
+        self._begin()
+        if body:
+            super().on_body(body)
+
+    def _begin(self) -> None:
+        super().on_headers_complete()
+        if not self.cycle:  # an upgrade
+            return
         if len(self.connections) > self._crowd:
             self.cycle.keep_alive = False
 

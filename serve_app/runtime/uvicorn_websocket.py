@@ -12,7 +12,7 @@ that are no messages are admitted by the handler. A connection whose frame is re
 
 import asyncio
 import struct
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, cast
@@ -74,11 +74,21 @@ class CloseStream(Exception):
         self.reason = reason[:120]
 
 
+class Deferred(Protocol):
+    """What a handler may await instead of a future: work that is cheaper together with that of other connections."""
+
+    def now(self) -> Any:
+        """Do the work at once, and return its outcome: an exception, or the value of the `await`."""
+
+    def later(self, loop: asyncio.AbstractEventLoop, go_on: Callable[[Any], None]) -> None:
+        """Do the work before the event loop polls again, and call `go_on` with the outcome."""
+
+
 class MessageHandler(Protocol):
     """Answers the messages of a connection."""
 
-    async def answer(self, data: bytes, is_text: bool) -> StreamMessage:
-        """The answer to a message. Raises CloseStream."""
+    async def answer(self, data: bytes, is_text: bool) -> StreamMessage | None:
+        """The answer to a message, if it has one. Awaits futures and `Deferred`. Raises CloseStream."""
 
     def admit_frame(self) -> float:
         """Count a control frame or a fragment. Returns 0, or the number of seconds until it may be handled."""
@@ -280,9 +290,8 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
                 and self.conn.state is State.OPEN
             ):
                 start = at + size
-                self._handle_message(
-                    apply_mask(bytes(arrived[start:end]), arrived[start - 4 : start]), arrived[at] == TEXT
-                )
+                payload = apply_mask(bytes(arrived[start:end]), arrived[start - 4 : start])
+                self._handle_message(payload, arrived[at] == TEXT, can_wait=end == len(arrived))
             elif wait := self._wait_for(arrived, at, at + size, end):
                 self._pause(wait)
                 break
@@ -308,32 +317,52 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
                 return 0.0
         return self._stream.admit_frame()
 
-    def _handle_message(self, data: bytes, is_text: bool) -> None:
-        """Answer a message, synchronously if the handler does not suspend."""
+    def _handle_message(self, data: bytes, is_text: bool, can_wait: bool = False) -> None:
+        """Answer a message, synchronously if the handler does not suspend.
+
+        can_wait: whether the answer can be deferred; with messages that have arrived already, it is sent in one write.
+        """
         assert self._stream is not None
-        steps = self._stream.answer(data, is_text).__await__()
+        self._advance(self._stream.answer(data, is_text).__await__(), None, can_wait)
+
+    def _advance(self, steps: Generator[Any, Any, StreamMessage | None], outcome: Any, can_wait: bool = False) -> None:
+        """Continue a handler with the value or the exception that it awaits."""
         try:
-            waits_for = steps.send(None)
+            waits_for = steps.throw(outcome) if isinstance(outcome, Exception) else steps.send(outcome)
         except StopIteration as done:
             self._queue_frame(done.value)
-            if done.value.pause:
+            if done.value is not None and done.value.pause:
                 self._pause(done.value.pause)
         except CloseStream as end:
             self.end(end.code, end.reason)
         else:
-            self._is_busy = True
-            self.transport.pause_reading()
-            task = self.loop.create_task(self._finish(steps, waits_for))
-            task.add_done_callback(self.on_task_complete)
-            self.tasks.add(task)
+            if asyncio.isfuture(waits_for) or waits_for is None:
+                self._is_busy = True
+                self.transport.pause_reading()
+                task = self.loop.create_task(self._finish(steps, waits_for))
+                task.add_done_callback(self.on_task_complete)
+                self.tasks.add(task)
+            elif can_wait:
+                self._is_busy = True  # nothing is read before the outcome is there
+                waits_for.later(self.loop, partial(self._end_wait, steps))
+            else:
+                self._advance(steps, waits_for.now())
 
-    async def _finish(self, steps: Generator[Any, Any, StreamMessage], waits_for: Any) -> None:
+    def _end_wait(self, steps: Generator[Any, Any, StreamMessage | None], outcome: Any) -> None:
+        self._is_busy = False
+        self._advance(steps, outcome)
+        if self._pending and not self._is_held:
+            self._resume()
+        else:
+            self._flush()
+
+    async def _finish(self, steps: Generator[Any, Any, StreamMessage | None], waits_for: Any) -> None:
         try:
             self._queue_frame(answer := await resume(steps, waits_for))
         except CloseStream as end:
             self.end(end.code, end.reason)
         else:
-            if answer.pause:
+            if answer is not None and answer.pause:
                 self._flush()
                 self._pause(answer.pause)
                 return
@@ -371,8 +400,8 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
         if not self._is_held:
             self.transport.resume_reading()
 
-    def _queue_frame(self, message: StreamMessage) -> None:
-        if not self.close_sent:
+    def _queue_frame(self, message: StreamMessage | None) -> None:
+        if message is not None and not self.close_sent:
             self._writes.append(_encode_frame(message))
 
     def _flush(self) -> None:

@@ -41,8 +41,9 @@ def test_what_is_recorded_is_read_again() -> None:
     ]
     write("startup", runs)
     assert recorded("startup") == runs
-    record("startup", "", [Target("wait", 3.0, "s")])
-    assert [target.name for run in recorded("startup") for target in run.targets] == ["rate", "wait"]
+    record("startup", "", [Target("wait", 3.0, "s"), Target("pace", 1.0, machine="another machine")])
+    assert [target.name for run in recorded("startup") for target in run.targets] == ["rate", "wait", "pace"]
+    assert [run.machine for run in recorded("startup")][::2] == ["a machine", "another machine"]
 
 
 @pytest.mark.usefixtures("results")

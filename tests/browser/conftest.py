@@ -8,11 +8,11 @@ import pytest
 from playwright.sync_api import Browser, expect, sync_playwright
 
 from serve_app.runtime.launch import running
-from tests.support.clients.browsers import ARGUMENTS, FAILED_REQUEST, Served, Tab
+from tests.support.clients.browsers import ARGUMENTS, Served, Tab
 from tests.support.leagues import browser_leagues
 from tests.support.leagues.tictactoe import LEAGUE
 
-TIMEOUT = 20_000
+TIMEOUT = 60_000
 """Timeout of each expectation, in milliseconds."""
 MOST_BUSY = 3
 """Requests of a test that a busy machine may answer with 503 or 504."""
@@ -43,9 +43,9 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def tab(served: Served, browser: Browser, request: pytest.FixtureRequest) -> Iterator[Tab]:
-    """A tab in a new session. Indirect parameters are options of the browser context."""
-    context = browser.new_context(**{"viewport": {"width": 1180, "height": 800}} | getattr(request, "param", {}))
+def tab(served: Served, browser: Browser) -> Iterator[Tab]:
+    """A tab in a new session."""
+    context = browser.new_context(viewport={"width": 1180, "height": 800})
     context.set_default_timeout(TIMEOUT)
     expect.set_options(timeout=TIMEOUT)
     tab = Tab(context.new_page(), served.url)
@@ -55,7 +55,7 @@ def tab(served: Served, browser: Browser, request: pytest.FixtureRequest) -> Ite
     tab.page.on("pageerror", lambda error: tab.errors.append(str(error)))
     yield tab
     context.close()
-    busy = [each for each in tab.errors if each.startswith((f"{FAILED_REQUEST}503", f"{FAILED_REQUEST}504"))]
+    busy = tab.failed(503, 504)
     assert len(busy) <= MOST_BUSY, "the pages repeat such a request"
-    tab.errors = [each for each in tab.errors if each not in busy]
-    assert tab.errors == []
+    ignored = {*busy, *tab.failed(*tab.expected)}
+    assert [error for error in tab.errors if error not in ignored] == []

@@ -60,9 +60,6 @@ def names(served: Served) -> dict[str, str]:
     return {"verdict": verdict.id, "schedule": verdict.schedule}
 
 
-@pytest.mark.parametrize(
-    "tab", [{"color_scheme": "light"}, {"color_scheme": "dark"}], indirect=True, ids=["light", "dark"]
-)
 @pytest.mark.parametrize("path", PAGES)
 def test_a_page(tab: Tab, names: dict[str, str], path: str) -> None:
     page = tab.open(path.format(**names))
@@ -70,7 +67,7 @@ def test_a_page(tab: Tab, names: dict[str, str], path: str) -> None:
         expect(page.locator("body")).to_contain_text(re.compile(words))
     expect(page.locator("h1")).to_have_count(1)
     assert page.title().endswith("Policy League")
-    assert serious(tab.page) == []
+    assert serious(page) == []
     page.set_viewport_size({"width": 360, "height": 740})
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (
         "the page scrolls horizontally on a phone"

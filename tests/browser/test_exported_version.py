@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Page, Route
 from league.policies.onnx import OnnxPolicy
 from league.policies.probes import excused
 from league.registry.registry import Registry
-from league.registry.storage.exports import export_version
+from league.registry.storage.exports import exported_files, write_files
 from league.settings import Storage
 from league.spaces import Discrete
 from tests.support.leagues.served_leagues import BOARD, publish, register
@@ -58,7 +58,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     register(registry, "board", {"shared": BOARD})
     publish(registry, "board", {"shared": masked_mlp(hidden=(64, 64))}, "run/1")
     target = tmp_path_factory.mktemp("exported") / "files"
-    export_version(registry.versions.get("board", 1), registry.artifacts, target)
+    write_files(exported_files(registry.versions.get("board", 1), registry.artifacts), target)
     registry.close()
     return target
 

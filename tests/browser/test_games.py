@@ -12,12 +12,14 @@ from PIL import Image, ImageColor
 from playwright.sync_api import Page, expect
 
 from evaluation.playback.environment_hooks import KNOWN
+from league.results.ledger import Ledger
 from tests.support.clients.browsers import Served, Tab
 from tests.support.environments.declaring import VIEWS as VIEWS_OF_AGENTS
 from tests.support.leagues.browser_leagues import (
     CONNECT_FOUR,
     HIDDEN,
     NAMED,
+    SEARCHED,
     TEAM,
     VIEWS,
     answer,
@@ -63,6 +65,37 @@ def test_a_game_is_played_back_step_by_step(tab: Tab, served: Served) -> None:
     expect(position).not_to_have_text(re.compile("^0 of"))  # the step is in the address
     page.keyboard.press("Home")
     expect(info).to_contain_text("Start")
+
+
+def test_a_search_version_analyses_a_recorded_game(tab: Tab, served: Served) -> None:
+    match = Ledger(served.registry).matches(league=SEARCHED)[0]
+    page = tab.open(f"/leagues/{SEARCHED}/matches/{match.schedule}/{match.position}/0")
+    info, chart = page.locator(".game-info"), page.get_by_role("img", name=re.compile("Expected return of player_1"))
+    expect(page.locator(".seek output")).to_have_text(re.compile("0 of"))
+    page.keyboard.press("End")
+    expect(info).to_contain_text("· end")
+    expect(chart).to_have_count(0)
+    page.get_by_label("Analysis").select_option("2")
+    expect(info).to_contain_text("expected return")
+    expect(chart).to_be_visible()
+    expect(info.get_by_role("list", name="Probabilities")).to_contain_text("%")
+    page.get_by_label("Analysis").select_option(label="none")
+    expect(chart).to_have_count(0)
+    expect(info).not_to_contain_text("expected return")
+
+
+def test_a_search_version_can_be_promoted(tab: Tab) -> None:
+    page = tab.open(f"/leagues/{SEARCHED}/versions")
+    version = page.get_by_role("row").filter(has_text=re.compile(r"search with @1, 40 simulations, puct, [\d.]+ ms"))
+    expect(version.get_by_role("button", name=f"Promote {SEARCHED}@2")).to_be_visible()
+
+
+def test_a_search_version_names_the_best_move(tab: Tab, served: Served) -> None:
+    page = open_game(tab, SEARCHED, "player_1")
+    expect(page.locator(".turn")).to_have_text(TURN)
+    page.get_by_label("Analysis").select_option("2")
+    expect(page.get_by_role("heading", name="Best move: ")).to_be_visible()
+    expect(page.locator(".game-info")).to_contain_text("expected return")
 
 
 AS_SOON_AS_VISIBLE = """

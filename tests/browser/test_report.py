@@ -12,8 +12,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from evaluation.documents import Difference
 from league.registry.registry import Registry
-from policy_league.cli.evaluation.report_contents import MOST_BYTES, MOST_VERDICTS, league_report
-from policy_league.cli.evaluation.report_file import report_file
+from policy_league.cli.evaluation.report_contents import MOST_BYTES, MOST_VERDICTS, league_report, report_file
 from tests.support.clients.browsers import serious
 from tests.support.leagues import reported_league
 from tests.support.leagues.tictactoe import LEAGUE
@@ -40,9 +39,9 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.fixture
-def opened(browser: Browser, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Open]:
-    """Opens a report in a new session. Indirect parameters are options of the browser context."""
-    context = browser.new_context(**{"viewport": {"width": 1180, "height": 800}} | getattr(request, "param", {}))
+def opened(browser: Browser, tmp_path: Path) -> Iterator[Open]:
+    """Opens a report in a new session."""
+    context = browser.new_context(viewport={"width": 1180, "height": 800})
     context.set_offline(True)
     context.set_default_timeout(TIMEOUT)
     expect.set_options(timeout=TIMEOUT)
@@ -71,9 +70,6 @@ def select(page: Page, tab: str) -> Page:
     return page
 
 
-@pytest.mark.parametrize(
-    "opened", [{"color_scheme": "light"}, {"color_scheme": "dark"}], indirect=True, ids=["light", "dark"]
-)
 def test_all_results_are_on_its_pages(opened: Open, report: dict[str, Any]) -> None:
     page = opened(report)
     expect(page.get_by_role("heading", level=1)).to_have_text(LEAGUE)

@@ -20,6 +20,7 @@ def home(tmp_path: Path) -> Path:
 def registry(home: Path, storage_at: StorageAt, monkeypatch: pytest.MonkeyPatch) -> Registry:
     """Three versions of tic-tac-toe: one that ignores threats, one that blocks, and one that wins and blocks."""
     registry = copy_of(_with_three_versions, storage_at(home))
+    monkeypatch.setattr("evaluation.matches.leaderboard.MAX_UPSETS", 1)  # whose pictures take most of a nightly run
     monkeypatch.setenv("LEAGUE_DATABASE_URL", registry.storage.database_url)
     return registry
 

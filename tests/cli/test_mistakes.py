@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import yaml
 
-from league.config.gate import GateConfig
 from league.registry.registry import Registry
 from tests.support.command import League
 from tests.support.leagues import tictactoe
@@ -385,13 +384,3 @@ def test_an_invalid_anchor(league: League, folder: Path, command: str, code: int
     result = league(command, "guess.yaml")
     assert result.code == code
     assert f"gate.anchors: {message}" in result.out + result.err
-
-
-def test_an_invalid_anchor_of_a_league_with_versions(league: League, registry: Registry) -> None:
-    row = registry.leagues.get("tictactoe")
-    invalid = row.config.model_copy(update={"gate": GateConfig.model_validate({"anchors": ["@9"]})})
-    registry.leagues.register(invalid, row.interface)
-    for command in (("nightly", "tictactoe"), ("evaluate", "tictactoe")):
-        result = league(*command)
-        assert result.code == 2
-        assert "gate.anchors: league tictactoe has no version 9; the newest is 3" in one_line(result.err)

@@ -17,8 +17,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 BLOCKS = 300
 """Matches of each of two versions against a slow bot."""
 HTTP_BLOCKS = 4
-HEAD_OUTAGE, DATABASE_OUTAGE = 30.0, 60.0
-"""Seconds without a head, and without the database."""
+HEAD_OUTAGE, DATABASE_OUTAGE = 30.0, 30.0
+"""Seconds without a head, and without the database: more than twice as long as its connections wait for packets."""
 WAIT = 60.0
 """Seconds for replicas to follow, on shared cores."""
 
@@ -47,9 +47,23 @@ def test_a_node_with_another_version_is_refused(cluster: LeagueCluster, director
     assert f"has onnxruntime 1.2.3, this one has {VERIFIED['onnxruntime']}" in said
 
 
+def test_no_attempt_is_lost_with_a_drained_worker(cluster: LeagueCluster) -> None:
+    """Replicas are started elsewhere first, and those of the worker finish their requests.
+
+    The server is not that of the following tests: a worker that joins again has no replicas.
+    """
+    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--yes", "--reason", "test")
+    with serving_scenarios.serving(cluster) as key:
+        calls, began, _ = serving_scenarios.drain_worker_while_serving(cluster, key)
+    assert calls.lost == calls.attempts_lost == []
+    assert len(calls.attempts_shed) < serving_scenarios.RARE * calls.report["attempts"], (
+        "while replicas start on the same cores"
+    )
+    assert calls.new_replicas(began), "others are started elsewhere"
+
+
 @pytest.fixture(scope="module")
 def key(cluster: LeagueCluster) -> Iterator[str]:
-    cluster.league(cluster.head, "promote", f"{scenarios.LEAGUE}@1", "--yes", "--reason", "test")
     with serving_scenarios.serving(cluster) as token:
         yield token
 

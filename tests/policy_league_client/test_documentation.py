@@ -1,21 +1,27 @@
 """The snippets on the pages of the client and of streams run as shown."""
 
 import ast
+import itertools
 import re
 import shutil
 import subprocess
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from league.config.league import LeagueConfig
+from league.environments.building import interface
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import BatchedEnvironment, each_agent_alone
+from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.inference.stream_codec import RESPONSE, encode_request
-from tests.support.leagues.served_leagues import BOARD, promote, publish, register
-from tests.support.policies.graphs import masked_mlp
-from tests.support.servers.streaming import listening
+from tests.support.servers.streaming import connect_four_server, listening
 
 ROOT = Path(__file__).parents[2]
 URL = "http://127.0.0.1:8000"
@@ -23,13 +29,8 @@ URL = "http://127.0.0.1:8000"
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    registry = Registry.open(Storage.at(tmp_path_factory.mktemp("shown")))
-    register(registry, "connect_four", {"shared": BOARD})
-    publish(registry, "connect_four", {"shared": masked_mlp()}, "run")
-    promote(registry, "connect_four", 1)
-    with listening(registry.storage) as listener:
-        yield listener.url
-    registry.close()
+    with connect_four_server(tmp_path_factory.mktemp("shown")) as server:
+        yield server
 
 
 def snippets(page: str, language: str) -> list[str]:
@@ -48,6 +49,30 @@ def test_snippets_run_in_order(
         printed = capsys.readouterr().out
         assert ("print(" in block) == bool(printed), block
     assert blocks
+
+
+def test_simulators_play_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The league is valid, and both programs play its episodes."""
+    page = "docs/simulators.md"
+    config = LeagueConfig.from_mapping(yaml.safe_load(snippets(page, "yaml")[0]))
+    registry = Registry.open(Storage.at(tmp_path))
+    registry.leagues.register(config, interface(config))
+    monkeypatch.setenv("LEAGUE_API_KEY", registry.keys.create("simulator", ["simulate"])[1])
+    needs = ForSimulators(registry.storage, config.league)
+    is_over = threading.Event()
+
+    def play(environment: BatchedEnvironment) -> None:
+        turn = environment.start(each_agent_alone(itertools.count(), 2))
+        while not is_over.is_set():
+            turn = environment.step({group: np.zeros(len(batch), np.int64) for group, batch in turn.batches.items()})
+
+    with listening(registry.storage) as server:
+        environment = stock_stepping(config.environment, 4, simulators=needs)
+        threading.Thread(target=play, args=(environment,), daemon=True).start()
+        names: dict[str, object] = {}
+        for block in snippets(page, "python"):
+            exec(compile(block.replace(URL, server.url), page, "exec"), names)
+        is_over.set()
 
 
 CHECK = """

@@ -21,7 +21,6 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
 from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards, rejected
-from tests.support.leagues.served_leagues import promote
 from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.replicas import LOCALHOST, QUICK, READ_ONLY
 from tests.support.waiting import until
@@ -265,32 +264,39 @@ def test_a_large_body_is_rejected(read_only_client: TestClient) -> None:
     assert rejected(read_only_client, None, 413, content=in_parts)["code"] == "body_too_large"
 
 
-def test_a_large_batch_is_rejected(read_only_client: TestClient) -> None:
-    error = rejected(read_only_client, {"observations": [BOARD] * 9}, 413)
-    assert error == {"code": "body_too_large", "message": "observations has 9 items, expected at most 8"}
-
-
 @pytest.mark.anyio
-async def test_the_number_of_concurrent_requests_is_limited(registry: Registry) -> None:
+@pytest.mark.parametrize(
+    ("path", "document", "handler"),
+    [
+        (ACTION, {"observation": BOARD}, "action"),
+        (
+            "/v2/models/vector/infer",
+            {"inputs": [{"name": "observation", "datatype": "FP32", "shape": [1, 2], "data": [0.5, -1]}]},
+            "inference",
+        ),
+    ],
+)
+async def test_the_number_of_concurrent_requests_is_limited(
+    registry: Registry, path: str, document: dict[str, Any], handler: str
+) -> None:
     server = Replica(registry, QUICK.model_copy(update={"max_in_flight": 2}), "replica-1")
     resume = asyncio.Event()
 
     async def body() -> AsyncIterator[bytes]:
         await resume.wait()
-        yield json.dumps({"observation": BOARD}).encode()
+        yield json.dumps(document).encode()
 
     transport = httpx.ASGITransport(server.application())
     async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
-        slow = [asyncio.create_task(client.post("/v1/policies/board/action", content=body())) for _ in range(2)]
-        while server.action.in_flight < 2:
+        slow = [asyncio.create_task(client.post(path, content=body())) for _ in range(2)]
+        while getattr(server, handler).in_flight < 2:
             await asyncio.sleep(0)
-        reply = await client.post("/v1/policies/board/action", json={"observation": BOARD})
-        assert (reply.status_code, reply.json()["code"]) == (429, "overloaded")
-        assert reply.headers["retry-after"] == "1"
+        reply = await client.post(path, json=document)
+        assert (reply.status_code, reply.headers["retry-after"]) == (429, "1")
         assert (await client.get("/v1/leagues")).status_code == 200
         resume.set()
         assert [(await each).status_code for each in slow] == [200, 200]
-        assert (await client.post("/v1/policies/board/action", json={"observation": BOARD})).status_code == 200
+        assert (await client.post(path, json=document)).status_code == 200
 
 
 @pytest.mark.anyio
@@ -314,12 +320,6 @@ async def test_the_number_of_other_concurrent_requests_is_limited(registry: Regi
 def test_strings_do_not_use_memory(read_only_client: TestClient) -> None:
     """NumPy would make each of these 1,000 strings as wide as the longest one: 16 MB."""
     rejected(read_only_client, {"observation": ["x" * 4_000] + [""] * 1_000}, model="vector")
-
-
-def test_a_promotion_is_followed(client: TestClient, registry: Registry) -> None:
-    for version in (2, 3, 1):
-        promote(registry, "board", version)
-        until(lambda version=version: act(client, observation=BOARD)["version"] == version)
 
 
 json_values = st.recursive(

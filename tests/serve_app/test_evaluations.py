@@ -1,5 +1,6 @@
 """Evaluations over HTTP, without playing games: submitted, rejected, listed and stopped."""
 
+from threading import Event
 from typing import Any
 
 import pytest
@@ -9,10 +10,8 @@ from league.registry.registry import Registry
 from serve_app.app import Replica
 from tests.support.databases import on_both_databases
 from tests.support.leagues.served_leagues import promote
-from tests.support.servers.replicas import QUICK, local_client, replica
+from tests.support.servers.replicas import QUICK, UnavailableEvaluation, local_client, replica
 from tests.support.waiting import until
-
-pytestmark = on_both_databases
 
 BOARD = "/v1/leagues/board/evaluations"
 
@@ -40,6 +39,26 @@ def start(
     return dict(reply.json())
 
 
+class NotifiedEvaluation(UnavailableEvaluation):
+    """An evaluation service that is only notified."""
+
+    def __init__(self) -> None:
+        self.is_notified = Event()
+
+    def notify(self) -> None:
+        """Remember it."""
+        self.is_notified.set()
+
+
+def test_replicas_start_the_service_for_an_interrupted_evaluation(registry: Registry) -> None:
+    registry.evaluations.submit("board", {"kind": "tournament"}, actor="bot", reason="test", max_active=1)
+    registry.evaluations.claim("a process that has ended", workers=1)
+    service = NotifiedEvaluation()
+    with local_client(Replica(Registry.open(registry.storage), QUICK, "replica-1", evaluation_client=service)):
+        until(service.is_notified.is_set)
+
+
+@on_both_databases
 def test_a_submitted_evaluation_is_queued_with_pinned_references(evaluator: TestClient, registry: Registry) -> None:
     contestants = ["board@champion", "board@3", "script:random"]
     reply = evaluator.post(
@@ -140,6 +159,7 @@ def test_evaluations_always_require_a_key(client: TestClient) -> None:
     assert client.delete(f"{BOARD}/1").status_code == 401
 
 
+@on_both_databases
 def test_a_repeated_call_starts_nothing(evaluator: TestClient, registry: Registry) -> None:
     first = start(evaluator, {"blocks": 4})
     assert start(evaluator, b' {"blocks" : 4} ') == first
@@ -148,6 +168,7 @@ def test_a_repeated_call_starts_nothing(evaluator: TestClient, registry: Registr
     assert len(registry.evaluations.newest("board")) == 1
 
 
+@on_both_databases
 def test_evaluations_are_paginated_newest_first(evaluator: TestClient) -> None:
     numbers = [start(evaluator, call=str(i))["evaluation"] for i in range(5)]
     page = evaluator.get(BOARD, params={"limit": 2}).json()
@@ -162,6 +183,7 @@ def test_an_invalid_page_is_rejected(evaluator: TestClient, query: str) -> None:
     assert evaluator.get(f"{BOARD}?{query}").json()["code"] == "invalid_input"
 
 
+@on_both_databases
 def test_a_queued_evaluation_is_stopped_at_once_and_once(evaluator: TestClient) -> None:
     number = start(evaluator)["evaluation"]
     stopped = evaluator.delete(f"{BOARD}/{number}")
@@ -176,12 +198,14 @@ def test_an_unknown_evaluation_is_reported(evaluator: TestClient, number: str) -
         assert (reply.status_code, reply.json()["code"]) == (404, "unknown_evaluation")
 
 
+@on_both_databases
 def test_an_evaluation_of_another_league_is_unknown(evaluator: TestClient) -> None:
     number = start(evaluator)["evaluation"]
     reply = evaluator.get(f"/v1/leagues/memory/evaluations/{number}")
     assert reply.json()["code"] == "unknown_evaluation"
 
 
+@on_both_databases
 def test_the_number_of_active_evaluations_is_limited(registry: Registry) -> None:
     with replica(registry.storage, QUICK.model_copy(update={"max_evaluations": 2})) as client:
         evaluator = with_key(client, registry, "bot", ["evaluate", "read"])
@@ -201,6 +225,7 @@ def test_a_missing_evaluation_service_is_reported(registry: Registry) -> None:
         assert evaluator.get(BOARD).json()["evaluations"] == []
 
 
+@on_both_databases
 def test_the_number_of_queued_evaluations_is_a_metric(evaluator: TestClient) -> None:
     start(evaluator)
     assert 'league_evaluations{league="board",replica="",state="queued"} 1.0' in evaluator.get("/metrics").text

@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from benchmarks.load.http import post
+from benchmarks.load.http import drive, post
 from league.registry.registry import Registry
 from league.settings import Storage
 from policy_league_client import Client
@@ -161,20 +161,22 @@ def test_slow_clients_do_not_affect_others(url: str) -> None:
 
 
 def test_excess_requests_are_asked_to_retry(url: str) -> None:
-    """Batches cost the server more than the clients, so that a queue persists."""
+    """The other connections cost the clients less than the server, so that a queue persists."""
     result: set[tuple[int, str | None]] = set()
+    request = httpx.Request("POST", f"{url}{ACTION}", json={"observations": [BOARD] * 64})
+
+    def is_running() -> bool:
+        return (429, "1") not in result
 
     async def exceed() -> None:
-        request = httpx.Request("POST", f"{url}{ACTION}", json={"observations": [BOARD] * 200})
         async with httpx.AsyncClient(timeout=30) as client:
-
-            async def call_repeatedly() -> None:
-                while (429, "1") not in result:
+            others = drive(str(request.url), request.content, 48, lambda *_: is_running(), is_running)
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(others)
+                while is_running():
                     reply = await client.send(request)
                     result.add((reply.status_code, reply.headers.get("retry-after")))
 
-            await asyncio.gather(*(call_repeatedly() for _ in range(48)))
-
     with without_failures(url):
         asyncio.run(asyncio.wait_for(exceed(), 60))
-    assert result == {(200, None), (429, "1")}
+    assert result <= {(200, None), (429, "1")}

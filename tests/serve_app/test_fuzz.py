@@ -16,6 +16,7 @@ from schemathesis.schemas import APIOperation
 from starlette.testclient import TestClient
 
 from league.errors import LeagueError
+from league.registry.keys import SCOPES
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import inputs
@@ -56,7 +57,7 @@ def storage_to_fuzz(tmp_path_factory: pytest.TempPathFactory) -> Storage:
 def fuzzed(storage_to_fuzz: Storage) -> Iterator[TestClient]:
     """A replica with a client key for all scopes. The served versions change during the test."""
     registry = Registry.open(storage_to_fuzz)
-    _, token = registry.keys.create("fuzz", ["act", "read", "evaluate", "promote"])
+    _, token = registry.keys.create("fuzz", SCOPES)
     registry.close()
     with replica(storage_to_fuzz) as client:
         client.headers["x-api-key"] = token

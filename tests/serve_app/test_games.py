@@ -20,11 +20,13 @@ from league.errors import GameHung, LeagueError, NoEvaluationService, NotReady, 
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match
+from league.search.policies import publish_search
 from league.service_requests import GameRequest, GameResponse
 from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.openapi.document import document
 from tests.support.leagues import tictactoe
+from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.replicas import QUICK, UnavailableEvaluation, local_client
 from tests.support.waiting import until
 
@@ -58,6 +60,10 @@ class FailingEvaluation(UnavailableEvaluation):
         raise self._error
 
 
+SEARCH, LONG_SEARCH = 4, 5
+"""Versions that search with few and with too many simulations."""
+
+
 class RecordingEvaluation(UnavailableEvaluation):
     """An evaluation service that records the requests."""
 
@@ -76,6 +82,10 @@ def playable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
     registry = tictactoe.registry(tmp_path_factory.mktemp("games") / "home")
     for graph in (tictactoe.graph(), tictactoe.graph(wins=True)):
         tictactoe.publish(registry, graph)
+    base = tictactoe.publish(registry, masked_mlp((3, 3, 2), 9), value=masked_mlp((3, 3, 2), 9, has_value=True))
+    league = registry.leagues.get(tictactoe.LEAGUE)
+    for simulations in (50, 5000):
+        publish_search(registry, base, league.config.environment, league.interface, "puct", simulations)
     registry.aliases.set(tictactoe.LEAGUE, "champion", 2, expected=None, actor="test", reason="test")
     evaluate(tictactoe.LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=registry, blocks=1)
     other = tictactoe.config(league="other")
@@ -88,9 +98,8 @@ def playable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
 def client(playable: Registry) -> Iterator[TestClient]:
     pool = GameWorkerPool()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LEAGUE_HOME", str(playable.storage.home))
-        patch.setenv("LEAGUE_DATABASE_URL", playable.storage.database_url)
-        patch.setenv("LEAGUE_ARTIFACTS", str(playable.storage.artifacts))
+        for name, value in playable.storage.environment.items():
+            patch.setenv(name, value)
         server = Replica(
             Registry.open(playable.storage), LONG_TIMEOUT, "replica-1", evaluation_client=LocalEvaluation(pool)
         )
@@ -147,7 +156,8 @@ def test_a_recorded_game_is_available_as_a_video(client: TestClient, match: Matc
 
 def test_agents_and_opponents_are_listed(client: TestClient) -> None:
     playable_agents = validated("Playability", client.get(f"{LEAGUE}/playable").json())
-    assert playable_agents["opponents"] == ["tictactoe@2", "tictactoe@1", "script:random", "script:one_ply"]
+    versions = [f"tictactoe@{number}" for number in range(LONG_SEARCH, 0, -1)]
+    assert playable_agents["opponents"] == [*versions, "script:random", "script:one_ply"]
     assert [seat["agent"] for seat in playable_agents["agents"]] == ["player_1", "player_2"]
     assert (playable_agents["playable"], playable_agents["draws"]) == (True, True)
     assert playable_agents["board"] == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
@@ -194,10 +204,26 @@ def test_an_illegal_choice_has_a_message_with_the_legal_ones(client: TestClient)
         ({"opponent": "script:first", "actions": [2, 4, 6, 8]}, 400, "invalid_input"),
         ({"kind": "table"}, 400, "invalid_input"),
         ({"chances": 1}, 400, "invalid_input"),
+        ({"analysis": 1}, 400, "invalid_input"),
+        ({"analysis": LONG_SEARCH}, 400, "invalid_input"),
+        ({"analysis": 99}, 404, "unknown_version"),
     ],
 )
 def test_invalid_games_are_rejected(client: TestClient, body: dict[str, Any], status: int, code: str) -> None:
     assert play(client, status=status, **body)["code"] == code
+
+
+def test_a_search_version_evaluates_recorded_and_played_games(client: TestClient, match: Match) -> None:
+    steps = client.get(f"{game(match)}?analysis={SEARCH}").json()["steps"]
+    assert all(-1 <= move["value"] <= 1 for move in steps[-1]["moves"])
+    assert [move["value"] for move in client.get(game(match)).json()["steps"][-1]["moves"]] == [None]
+    state = play(client, opponent="script:first", seed=1, actions=[2, 4], analysis=SEARCH)
+    assert state["chances"][0][0] == 6, "2, 4 and 6 are a line"
+    assert state["value"] > 0.5
+    assert play(client, opponent="script:first", seed=1, actions=[2, 4])["value"] is None
+    against = play(client, opponent=f"tictactoe@{SEARCH}", agent="player_2", seed=1, chances=True)
+    assert against["steps"][-1]["moves"][0]["value"] is not None
+    assert sum(chance for _, chance in against["chances"]) == pytest.approx(1, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -215,6 +241,8 @@ def test_invalid_games_are_rejected(client: TestClient, body: dict[str, Any], st
         ("{match}/games/0?from=-1", 400, "invalid_input"),
         ("{match}/games/0?every=0", 400, "invalid_input"),
         ("{match}/games/0?to=99999999999", 400, "invalid_input"),
+        ("{match}/games/0?analysis=1", 400, "invalid_input"),
+        ("{match}/games/0?analysis=99", 404, "unknown_version"),
     ],
 )
 def test_unknown_games_are_reported(client: TestClient, match: Match, path: str, status: int, code: str) -> None:

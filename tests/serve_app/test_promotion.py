@@ -16,8 +16,6 @@ from tests.support.databases import on_both_databases
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import replica
 
-pytestmark = on_both_databases
-
 CHAMPION = "/v1/leagues/board/aliases/champion"
 ROLLBACK = "/v1/leagues/board/rollback"
 
@@ -38,6 +36,7 @@ def change(client: TestClient, path: str, key: str, body: Any = None, status: in
     return reply.json()
 
 
+@on_both_databases
 def test_a_promotion_is_in_the_history_with_the_name_of_the_key(promoter: TestClient, registry: Registry) -> None:
     event = change(promoter, CHAMPION, "a", {"version": 2, "expected": 1, "reason": "it is stronger"})
     assert event.pop("at")
@@ -56,12 +55,14 @@ def test_a_promotion_is_in_the_history_with_the_name_of_the_key(promoter: TestCl
     assert (newest.version, newest.actor, newest.reason) == (2, "release-bot", "it is stronger")
 
 
+@on_both_databases
 def test_a_rollback_returns_to_the_previous_champion(promoter: TestClient, registry: Registry) -> None:
     promote(registry, "board", 2)
     event = change(promoter, ROLLBACK, "a")
     assert (event["kind"], event["version"], event["previous"]) == ("rollback", 1, 2)
 
 
+@on_both_databases
 def test_a_rollback_of_another_version_changes_nothing(promoter: TestClient, registry: Registry) -> None:
     """Two people who roll back the same version do not go back twice."""
     for version in (2, 3):
@@ -72,6 +73,7 @@ def test_a_rollback_of_another_version_changes_nothing(promoter: TestClient, reg
     assert change(promoter, ROLLBACK, "c", {"expected": None})["version"] == 1
 
 
+@on_both_databases
 def test_a_repeated_call_changes_nothing(promoter: TestClient, registry: Registry) -> None:
     promote(registry, "board", 2)
     promote(registry, "board", 3)
@@ -84,6 +86,7 @@ def test_a_repeated_call_changes_nothing(promoter: TestClient, registry: Registr
     assert registry.aliases.current("board")["champion"] == 2
 
 
+@on_both_databases
 def test_concurrent_calls_are_applied_once(promoter: TestClient, registry: Registry) -> None:
     for version in (2, 3):
         promote(registry, "board", version)
@@ -93,6 +96,7 @@ def test_concurrent_calls_are_applied_once(promoter: TestClient, registry: Regis
     assert registry.aliases.current("board")["champion"] == 2
 
 
+@on_both_databases
 def test_the_expected_version_is_checked(promoter: TestClient, registry: Registry) -> None:
     assert change(promoter, CHAMPION, "a", {"version": 2, "expected": 3}, 409)["code"] == "alias_moved"
     assert change(promoter, CHAMPION, "b", {"version": 2, "expected": None}, 409)["code"] == "alias_moved"
@@ -102,6 +106,7 @@ def test_the_expected_version_is_checked(promoter: TestClient, registry: Registr
     change(promoter, ROLLBACK, "d", status=409)
 
 
+@on_both_databases
 def test_a_mixture_is_published_once_and_promoted(promoter: TestClient, registry: Registry) -> None:
     members = [{"version": 3, "probability": 0.4}, {"version": 1, "probability": 0.6}]
     event = change(promoter, CHAMPION, "a", {"members": members, "expected": 1})
@@ -173,6 +178,7 @@ def locked(registry: Registry) -> Iterator[None]:
         yield
 
 
+@on_both_databases
 def test_a_change_that_timed_out_is_not_applied_later(promoter: TestClient, registry: Registry) -> None:
     headers = {"idempotency-key": "late", "x-request-timeout-ms": "300"}
     with locked(registry):
@@ -183,6 +189,7 @@ def test_a_change_that_timed_out_is_not_applied_later(promoter: TestClient, regi
     assert [event.version for event in registry.aliases.history("board")] == [3, 1]
 
 
+@on_both_databases
 def test_waiting_changes_do_not_delay_reading(registry: Registry) -> None:
     _, token = registry.keys.create("operator", ["promote", "read"])
     with replica(registry.storage) as client, ThreadPoolExecutor(8) as pool:

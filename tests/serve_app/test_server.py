@@ -166,17 +166,15 @@ def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
 def test_mixtures_are_swapped_under_load_and_pinned_in_every_replica(url: str, served: Registry) -> None:
     promote(served, "board", 1)
     mixtures = [served.publisher.publish_mixture("board", shares) for shares in ({1: 0.3, 3: 0.7}, {2: 0.5, 3: 0.5})]
-    with load(versions_of(url), callers=4) as seen:
+    # New connections, which reach any replica.
+    with httpx.Client(base_url=url, headers={"connection": "close"}) as client, load(versions_of(url), 4) as seen:
         for row in mixtures * 2:
             promote(served, "board", row.number)
             served.changes.wait_for_alias(served.aliases.history("board")[0], 30)
             assert row.mixture is not None
             for number in range(20):
                 member = row.mixture.version_of("board", f"episode-{number}".encode())
-                # A new connection reaches any replica.
-                reply = httpx.post(
-                    url + ACTION, json={"observation": BOARD}, headers={"x-league-key": f"episode-{number}"}
-                )
+                reply = client.post(ACTION, json={"observation": BOARD}, headers={"x-league-key": f"episode-{number}"})
                 assert reply.json()["version"] == member
         promote(served, "board", 1)
         served.changes.wait_for_alias(served.aliases.history("board")[0], 30)
@@ -433,6 +431,27 @@ def test_a_concurrent_nightly_run_fails_and_the_next_one_promotes(evaluator: htt
     assert served.aliases.current("tictactoe")["champion"] == 2
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_evaluation_service_runs_only_while_it_is_needed(tmp_path: Path) -> None:
+    registry = Registry.open(Storage.at(tmp_path))
+    tictactoe.playable(registry)
+    _, token = registry.keys.create("night-owl", ["act", "read", "evaluate"])
+
+    def has_ended() -> bool:
+        return registry.snapshots.stale() == [] and not processes(registry.storage, ":EvaluationService")
+
+    with (
+        running(registry.storage, replicas=1) as url,
+        httpx.Client(base_url=url, headers={"x-api-key": token}, timeout=30) as client,
+    ):
+        until(lambda: processes(registry.storage, ":EvaluationService"))
+        until(has_ended, seconds=500)
+        assert wait_for_end(client, start(client, blocks=1))["state"] == "done"
+        assert processes(registry.storage, ":EvaluationService")
+        until(has_ended, seconds=500)
+
+
 def retry_until_ready(send_request: Callable[[], httpx.Response]) -> httpx.Response:
     """The response of a request that may first time out."""
     replies: list[httpx.Response] = []
@@ -476,6 +495,27 @@ def test_a_game_survives_the_death_of_any_process(evaluator: httpx.Client, serve
     rejected = evaluator.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
     assert (rejected.status_code, rejected.json()["code"]) == (422, "illegal_action")
     assert "Traceback" not in rejected.text
+
+
+@pytest.mark.slow
+def test_the_metrics_of_ray_contain_actions(storage: Storage) -> None:
+    """The count of requests, and the gauges that Ray's dashboard shows of autoscaling."""
+    with running(storage, replicas=1, dashboard=True) as url:
+        (raylet,) = processes(storage, "raylet/raylet")
+        session = re.search(r"/[^\0]*/session_[\d_-]+", Path(f"/proc/{raylet}/cmdline").read_text())
+        assert session is not None
+        (port,) = Path(session[0]).glob("metrics_export_port_*")
+
+        def total(metric: str, label: str = 'deployment="PolicyServer"') -> float:
+            """The sum of a metric's samples with a label, after one more action."""
+            httpx.post(f"{url}{ACTION}", json={"observation": BOARD}).raise_for_status()
+            text = httpx.get(f"http://127.0.0.1:{port.read_text()}/metrics").text
+            samples = re.findall(rf"^ray_serve_{metric}\{{(.*)\}} (\S+)$", text, flags=re.M)
+            return sum(float(value) for labels, value in samples if label in labels)
+
+        until(lambda: total("deployment_request_counter_total", 'route="/v1/policies/{model}/action"') > 0)
+        until(lambda: total("autoscaling_desired_replicas") == total("autoscaling_target_replicas") == 1)
+        until(lambda: total("autoscaling_total_requests") > 0)
 
 
 @pytest.mark.slow

@@ -23,6 +23,9 @@ from serve_app.settings import ServeSettings
         ({"root_path": "/ai?x"}, "expected a path like /ai"),
         ({"root_path": "/leagues"}, "begins like a path of this server"),
         ({"root_path": "/v1/ai"}, "begins like a path of this server"),
+        ({"cors_origins": ["*"]}, "expected an origin like"),
+        ({"cors_origins": ["https://game.example/"]}, "expected an origin like"),
+        ({"cors_origins": ["https://game.example"], "require_keys": "never"}, "cors_origins needs API keys"),
     ],
 )
 def test_inconsistent_settings_are_rejected(setting: dict[str, Any], message: str) -> None:

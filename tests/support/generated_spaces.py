@@ -38,9 +38,9 @@ from league.spaces import ACTION_MASK, inputs
 from league.spaces.arrays import mask_size, tensors
 from league.spaces.conversion import from_gymnasium, to_gymnasium
 from serve_app.app import Replica
-from serve_app.openapi.examples import observation as example
+from serve_app.openapi.document import observation as example
 from serve_app.settings import ServeSettings
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.export import parity
 from training.export.publish import MODULES, Checkpoint, publish
 from training.learners.ppo import PPOLearner

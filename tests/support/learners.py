@@ -1,12 +1,13 @@
 """PPO learners and episodes of a league, without a running algorithm."""
 
+from collections.abc import Collection
 from typing import Any
 
 from ray.rllib.core.learner.training_data import TrainingData
 
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.learners.ppo import PPOLearner
 from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.episode_chunks import EpisodeChunks
@@ -19,10 +20,10 @@ def learner_of(league: LeagueConfig, **options: Any) -> PPOLearner:
     return learner
 
 
-def episodes_of(league: LeagueConfig) -> list[EpisodeChunks]:
+def episodes_of(league: LeagueConfig, taught: Collection[str] = ()) -> list[EpisodeChunks]:
     runner = BatchedEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
     try:
-        return runner.sample_chunks(num_timesteps=256)
+        return runner.sample_chunks(num_timesteps=256, taught=taught)
     finally:
         runner.stop()
 

@@ -5,7 +5,7 @@ import torch
 
 
 @pytest.fixture(autouse=True, scope="session")
-def one_thread() -> Iterator[None]:
+def one_thread(parsed_operators: None) -> Iterator[None]:
     """With networks this small, several threads cost more than they save, in particular on a busy machine."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

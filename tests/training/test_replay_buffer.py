@@ -124,6 +124,20 @@ def test_rows_are_drawn_by_priority_with_importance_weights() -> None:
     np.testing.assert_allclose(sample.weights, (weights / weights.max())[sample.indices], rtol=1e-5)
 
 
+@pytest.mark.parametrize("priorities", [None, PrioritiesConfig()])
+def test_several_draws_at_once_equal_consecutive_ones(priorities: PrioritiesConfig | None) -> None:
+    at_once, alone = (ReplayBuffer(64, priorities=priorities, seed=1) for _ in range(2))
+    for replay in (at_once, alone):
+        replay.add(block(list(range(50)), [0] * 50, [True] + [False] * 49))
+        replay.prioritize(np.arange(50), np.arange(50.0))
+    drawn = at_once.sample(7, draws=3, n_step=2, gamma=GAMMA, beta=0.5)
+    singly = [alone.sample(7, n_step=2, gamma=GAMMA, beta=0.5) for _ in range(3)]
+    assert drawn.indices.tolist() == [index for sample in singly for index in sample.indices]
+    assert drawn.weights.tolist() == [weight for sample in singly for weight in sample.weights]
+    for name, column in drawn.rows.items():
+        np.testing.assert_array_equal(column, np.concatenate([sample.rows[name] for sample in singly]))
+
+
 def test_new_rows_have_the_largest_priority() -> None:
     replay = ReplayBuffer(8, priorities=PrioritiesConfig(alpha=1.0))
     replay.add(block([0, 1], [0, 1], [True] * 2))

@@ -26,6 +26,7 @@ from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 from ray.rllib.utils.checkpoints import Checkpointable
 from ray.tune import tune
 from ray.tune.execution import tune_controller
+from ray.tune.execution.class_cache import _ActorClassCache
 from ray.tune.experiment import Trial
 from ray.tune.experimental import output
 from ray.tune.logger.tensorboardx import TBXLoggerCallback
@@ -37,6 +38,7 @@ from training import rllib_compat
 COMPAT = "training.rllib_compat"
 DOCUMENTED = {
     *("ray", "ray.tune", "ray.tune.registry", "ray.tune.schedulers", "ray.tune.experiment", "ray.job_submission"),
+    *("ray.tune.search", "ray.tune.search.optuna"),
     *("ray.exceptions", "ray.rllib.core", "ray.rllib.core.columns", "ray.rllib.core.learner.learner"),
     *("ray.rllib.algorithms", "ray.rllib.algorithms.algorithm", "ray.rllib.algorithms.algorithm_config"),
     *("ray.rllib.core.rl_module.rl_module", "ray.rllib.core.rl_module.multi_rl_module"),
@@ -126,6 +128,8 @@ def test_only_rllib_compat_overrides_private_methods_of_ray() -> None:
 
 
 INTERNALS: list[tuple[str, Any, str]] = [
+    ("use_waiting_workers", tune_controller.TuneController, "self._class_cache.get(trainable_cls)"),
+    ("use_waiting_workers", _ActorClassCache, "ray.remote(runtime_env=runtime_env)(trainable_cls)"),
     ("EpisodeChunk", SingleAgentEpisode.__init__, "self.validate()"),
     ("ChunkColumn", InfiniteLookbackBuffer, "self._space_struct = get_base_struct_from_space(value)"),
     (

@@ -31,7 +31,7 @@ from league.environments.building import interface
 from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous
 from tests.support.leagues.training_leagues import counting, solvable, tictactoe
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.learners.train_batch import minibatches, train_batch
 from training.modules.actor_critic import ActorCritic
 from training.rllib_compat import EpisodeChunk

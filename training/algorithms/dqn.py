@@ -6,41 +6,39 @@ from. Recurrent networks learn from sequences of an agent's transitions (Kapturo
 replay in distributed reinforcement learning", without its burn-in, n-step returns and priorities).
 """
 
-from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 
-from league.config.league import LeagueConfig
 from league.config.off_policy import DQNConfig
 from league.errors import ConfigError
 from league.interface import Interface
-from league.settings import Storage
 from league.spaces import Discrete
-from training.algorithms.off_policy import off_policy_config
+from training.algorithms.off_policy import OffPolicy
 from training.algorithms.rllib_config import encoder_settings, rl_module_specs
 from training.learners.dqn import DQNLearner
 from training.modules.q_network import QNetwork
 
 
-def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
-    """See `training.algorithms.rllib_config.algorithm_config`."""
-    assert isinstance(league.training, DQNConfig)
-    modules = module_spec(league.training, interface)
-    return off_policy_config(league, interface, storage, modules=modules, learner=DQNLearner)
+class DQN(OffPolicy):
+    """Each policy learns from its own buffer."""
 
+    settings_class = DQNConfig
+    module_class = QNetwork
+    learner_class = DQNLearner
 
-def module_spec(settings: DQNConfig, interface: Interface) -> MultiRLModuleSpec:
-    """Return the modules of all policies. Raises ConfigError for actions that are not Discrete."""
-    for policy in interface.policy_ids:
-        action = interface.of_policy(policy).action
-        if not isinstance(action, Discrete):
-            raise ConfigError(
-                f"policies.{policy}: dqn needs Discrete actions, got {action!r}: train it with algorithm: ppo"
-            )
-    atoms = settings.distributional
-    model_config = encoder_settings(settings) | {
-        "dueling": settings.dueling,
-        "noisy": settings.noisy,
-        "recurrence": settings.recurrence and settings.recurrence.width,
-        "atoms": atoms and (atoms.atoms, atoms.low, atoms.high),
-    }
-    return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, QNetwork, model_config))
+    @classmethod
+    def module_spec(cls, settings: DQNConfig, interface: Interface) -> MultiRLModuleSpec:
+        """Return the modules of all policies. Raises ConfigError for actions that are not Discrete."""
+        for policy in interface.policy_ids:
+            action = interface.of_policy(policy).action
+            if not isinstance(action, Discrete):
+                raise ConfigError(
+                    f"policies.{policy}: dqn needs Discrete actions, got {action!r}: train it with algorithm: ppo"
+                )
+        atoms = settings.distributional
+        model_config = encoder_settings(settings) | {
+            "dueling": settings.dueling,
+            "noisy": settings.noisy,
+            "recurrence": settings.recurrence and settings.recurrence.width,
+            "atoms": atoms and (atoms.atoms, atoms.low, atoms.high),
+        }
+        return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, cls.module_class, model_config))

@@ -22,6 +22,7 @@ from league.random.seeds import generator
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.payoffs import UNKNOWN, Scores, payoff_matrix, shrunk
+from league.results.sums import outcomes, whole
 from league.settings import Storage
 from training.algorithms.opponent_distribution import opponent_distribution, systematic_counts
 from training.sampling.self_play import EPISODES, GAMES, OPPONENTS, SCORE
@@ -122,7 +123,9 @@ class LeagueOpponents:
             self.candidates = tuple(rows)
             reads_results = parent is not None or settings.sampling in ("nash", "alpha_rank")
             conditions = registry.leagues.get(self._league.league).conditions
-            results = Ledger(registry).results(self._league.league, conditions) if reads_results else []
+            ledger, league = Ledger(registry), self._league.league
+            sums = ledger.sums(league, ledger.counted(league, conditions)) if reads_results else {}
+        results = list(outcomes(whole(sums)))
         for ref, source in rows.items():
             if source in self._unpublished:
                 self._rows[ref] = self._unpublished.pop(source)
@@ -173,18 +176,21 @@ class LeagueOpponents:
         self._rows, self._unpublished = dict(state["rows"]), dict(state["unpublished"])
 
     def _versions(self, registry: Registry) -> dict[str, str]:
-        """Return the versions that may be candidates → their sources: exploiters, then the others, by age."""
+        """Return the versions that may be candidates → their sources: exploiters, then the others, by age.
+
+        Members play for a mixture, and a search version plays without its search.
+        """
         assert self._settings is not None
         league = self._league.league
         numbers = registry.versions.numbers(league).get(league, [])
-        mixtures, exploiters = registry.versions.mixtures(league, numbers), registry.versions.exploiter_refs(league)
-        numbers = [number for number in numbers if number not in mixtures]
+        players, exploiters = registry.versions.players(league, numbers), registry.versions.exploiter_refs(league)
+        numbers = [number for number in numbers if number not in players]
         candidates = {number for number in numbers if f"{league}@{number}" not in exploiters}
         candidates = set(sorted(candidates)[-self._settings.window :])
         champions = {event.version for event in registry.aliases.history(league)}
         if self._settings.champions:
             for champion in champions:
-                candidates |= {champion} if champion not in mixtures else set(mixtures[champion].versions)
+                candidates |= set(players.get(champion, (champion,)))
         if self._settings.exploiters:
             of_champions = registry.versions.exploiters(league, [f"{league}@{champion}" for champion in champions])
             newest = {exploiter.exploits: exploiter.number for exploiter in of_champions}

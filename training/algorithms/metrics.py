@@ -2,12 +2,13 @@
 
 docs/curves.md explains the curves. In addition: `episodes` and `crashes`, the episodes that ended and that were lost
 because the environment raised; `agents/<agent>/return` and `length` of one agent; `time/<phase>`, wall time since the
-last report in seconds, with `time/other` for the rest; with a GPU, `gpu/memory_gb`, the learner's peak memory, and
-`gpu/utilization`. A centralised off-policy learner reports under `joint`.
+last report in seconds, with `time/other` for the rest, and `time/runners_…`, the time of all runners together; with a
+GPU, `gpu/memory_gb`, the learner's peak memory, and `gpu/utilization`. A centralised off-policy learner reports under
+`joint`.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -28,18 +29,24 @@ from ray.rllib.utils.metrics import (
 )
 
 from league.interface import Interface
-from training.algorithms.league_algorithm import SHARE
+from training.algorithms.league_algorithm import SHARE, WAITING_TIMER
 from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, SCHEDULES, TEACHER_LOSS, TEACHER_WEIGHT
 from training.sampling.closed_transitions import JOINT
+from training.sampling.env_runner import IDLE_SECONDS, SAMPLING_SECONDS
 from training.sampling.play_metrics import CRASHES, ENTROPY, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 from training.sampling.self_play import OPPONENTS, SCORE
 
 RETURN = "return"
 PHASES = {
     "time/sampling": ENV_RUNNER_SAMPLING_TIMER,
+    "time/waiting": WAITING_TIMER,
     "time/learning": LEARNER_UPDATE_TIMER,
     "time/weights": SYNCH_WORKER_WEIGHTS_TIMER,
 }
+"""Of the process of the learner, whose wall time they divide, together with OTHER_TIME. With runners, it waits for
+samples instead of sampling."""
+RUNNER_TIMES = {"time/runners_sampling": SAMPLING_SECONDS, "time/runners_idle": IDLE_SECONDS}
+"""Of all remote runners together."""
 CHECKPOINT_TIME = "time/checkpoint"
 OTHER_TIME = "time/other"
 """Wall time of updates outside of the phases: RLlib's bookkeeping and metrics."""
@@ -53,10 +60,9 @@ PPO_METRICS = {
 }
 REFERENCE_METRICS = (MAGNET_KL, MAGNET_WEIGHT, TEACHER_LOSS, TEACHER_WEIGHT)
 """Reported only with a magnet or a teacher."""
-OFF_POLICY_METRICS = ("loss", "value", "error", "gradient_norm")
-ACTOR_METRICS = ("policy_loss", "critic_gradient_norm")
+OFF_POLICY_METRICS = {name: name for name in ("loss", "value", "error", "gradient_norm")}
+ACTOR_METRICS = {name: name for name in ("policy_loss", "critic_gradient_norm")}
 """With critics, `loss`, `value` and `error` are the critic's and `gradient_norm` is the actor's."""
-METRICS_BY_ALGORITHM = {"ppo": tuple(PPO_METRICS), "maddpg": (*OFF_POLICY_METRICS, *ACTOR_METRICS)}
 EXPLORATION = "exploration"
 """Off-policy algorithms log it at the top level of RLlib's result."""
 
@@ -67,9 +73,9 @@ def time_each_update(algorithm: Algorithm) -> None:
         algorithm.metrics.log_time((TIMERS, timer), reduce="mean", window=1)
 
 
-def metric_names(interface: Interface, algorithm: str = "ppo") -> set[str]:
-    """Return the names of the metrics that an algorithm reports for a league."""
-    of_policy = {RETURN, "length", "entropy", *METRICS_BY_ALGORITHM.get(algorithm, OFF_POLICY_METRICS)}
+def metric_names(interface: Interface, curves: Iterable[str] = PPO_METRICS) -> set[str]:
+    """Return the names of the metrics that an algorithm with these curves reports for a league."""
+    of_policy = {RETURN, "length", "entropy", *curves}
     return (
         {RETURN, "length"}
         | {f"{policy}/{name}" for policy in interface.policy_ids for name in of_policy}
@@ -77,9 +83,13 @@ def metric_names(interface: Interface, algorithm: str = "ppo") -> set[str]:
     )
 
 
-def training_metrics(result: Mapping[str, Any], interface: Interface) -> dict[str, float]:
-    """Return the metrics of one update, without those that did not occur in it, such as the return of ended
-    episodes."""
+def training_metrics(
+    result: Mapping[str, Any], interface: Interface, curves: Mapping[str, str] = PPO_METRICS
+) -> dict[str, float]:
+    """Return the metrics of one update, without those that did not occur in it, such as the return of ended episodes.
+
+    curves: of the algorithm.
+    """
     play = result[ENV_RUNNER_RESULTS]
     metrics: dict[str, Any] = {
         RETURN: play.get(EPISODE_RETURN_MEAN),
@@ -99,17 +109,21 @@ def training_metrics(result: Mapping[str, Any], interface: Interface) -> dict[st
     metrics = {name: value for name, value in metrics.items() if value is not None and not math.isnan(value)}
     for key in (*interface.policy_ids, JOINT):
         learned = result.get(LEARNER_RESULTS, {}).get(key, {})
-        metrics |= {f"{key}/{name}": learned.get(metric) for name, metric in PPO_METRICS.items()}
+        metrics |= {f"{key}/{name}": learned.get(metric) for name, metric in curves.items()}
         metrics |= {f"{key}/{name}": learned.get(name) for name in (*SCHEDULES.values(), *REFERENCE_METRICS)}
-        metrics |= {f"{key}/{name}": learned.get(name) for name in (*OFF_POLICY_METRICS, *ACTOR_METRICS)}
     return {name: float(value) for name, value in metrics.items() if value is not None}
 
 
 def totals(result: Mapping[str, Any]) -> dict[str, float]:
-    """Return the metrics that add up over updates: episodes, crashes, and the seconds of each phase."""
-    play = result[ENV_RUNNER_RESULTS]
+    """Return the metrics that add up over updates: episodes, crashes, and the seconds of each phase that occurred."""
+    play, timers = result[ENV_RUNNER_RESULTS], result[TIMERS]
     counts = {"episodes": float(play.get(NUM_EPISODES, 0)), "crashes": float(play.get(CRASHES, 0))}
-    return counts | {name: float(result[TIMERS].get(timer, 0.0)) for name, timer in PHASES.items()}
+    times = {
+        name: float(timers[timer]) for name, timer in PHASES.items() if not math.isnan(timers.get(timer, math.nan))
+    }
+    if "time/waiting" in times:
+        times |= {name: float(play[key]) for name, key in RUNNER_TIMES.items()}
+    return counts | times
 
 
 def gpu_use() -> dict[str, float]:

@@ -1,16 +1,14 @@
 """Base of the algorithms that learn from a replay buffer: sample, store, learn, update targets, sync weights.
 
-To add an algorithm (`training/algorithms/dqn.py` is the shortest example), write:
+To add an algorithm (`policy_league/examples/extending/sac.py` is an example), write:
 
-- the settings: a subclass of OffPolicyConfig in league/config/off_policy.py, a member of the union and a name in
-  ALGORITHMS (league/config/algorithms.py), and rows in docs/configuration.md;
-- `training/algorithms/<name>.py` with `algorithm_config(league, interface, storage)`, which calls `off_policy_config`
-  with a runner, a learner and modules, and `module_spec(settings, interface)`. Its modules are PolicyModules, which
-  observe one agent only; they act and are exported;
+- the settings: a subclass of OffPolicyConfig;
+- the module of a policy: a PolicyModule, which observes one agent only; it acts and is exported;
+- the learner: a subclass of `training.learners.off_policy.OffPolicyLearner`. It holds and saves targets, mixers and
+  critics, and receives samples by the keys of the buffers;
 - the runner: ReplayRunner for transitions of each policy, JointRunner for joint ones (the columns are listed in
   training/sampling/closed_transitions.py). The keys of the buffers are policy ids, or JOINT alone;
-- the learner: a subclass of `training.learners.off_policy.OffPolicyLearner`. It holds and saves targets, mixers and
-  critics, and receives samples by the keys of the buffers.
+- a subclass of OffPolicy that names these, and its entry point in `policy_league.algorithms`.
 
 Resuming is exact: buffers, targets, optimisers and counters are in the checkpoint, and `reset_episodes` derives all
 randomness from the seed and the number of steps so far.
@@ -26,8 +24,6 @@ from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core import COMPONENT_RL_MODULE
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.utils.metrics import (
-    ENV_RUNNER_RESULTS,
-    ENV_RUNNER_SAMPLING_TIMER,
     LEARNER_RESULTS,
     LEARNER_UPDATE_TIMER,
     SYNCH_WORKER_WEIGHTS_TIMER,
@@ -43,28 +39,53 @@ from league.random.seeds import derive
 from league.settings import Storage
 from training.algorithms import rllib_config
 from training.algorithms.league_algorithm import LeagueAlgorithm
-from training.algorithms.metrics import EXPLORATION
-from training.algorithms.rllib_config import configure
+from training.algorithms.metrics import EXPLORATION, OFF_POLICY_METRICS
+from training.algorithms.rllib_config import ImportingConfig, configure, encoder_settings, rl_module_specs
 from training.learners.off_policy import OffPolicyLearner
 from training.replay_buffer import ReplayBuffer, Sample, saved_capacity
 from training.rllib_compat import ExplicitConfig, local_learner
 from training.sampling.closed_transitions import JOINT
-from training.sampling.env_runner import LEAGUE
 from training.sampling.replay_runner import JointRunner, ReplayRunner
 
 ITERATION_STEPS = 1024
 """Minimum number of actions per `training_step`: RLlib's overhead per call equals the cost of many actions."""
+ROWS_AT_ONCE = 8192
+"""Number of rows that are drawn at once for several gradient steps; more would take much memory if they hold images."""
 REPLAY = "replay"
 """Directory of the buffers in a checkpoint."""
 COUNTERS = "off_policy"
 
 
+class OffPolicyRLlibConfig(ImportingConfig, ExplicitConfig):
+    """RLlib's configuration of an off-policy algorithm."""
+
+
 class OffPolicy(LeagueAlgorithm):
     """An RLlib Algorithm with one replay buffer per policy, or one of joint transitions."""
 
+    settings_class = OffPolicyConfig
+    runner_class = ReplayRunner
+    curves = OFF_POLICY_METRICS
+
+    @classmethod
+    def algorithm_config(cls, league: LeagueConfig, interface: Interface, storage: Storage | None) -> AlgorithmConfig:
+        """See `training.algorithms.rllib_config.algorithm_config`."""
+        config = OffPolicyRLlibConfig(algo_class=cls)
+        configure(config, league, interface, storage)
+        assert isinstance(league.training, OffPolicyConfig)
+        config.training(lr=league.training.lr, gamma=league.training.gamma)
+        return config
+
+    @classmethod
+    def module_spec(cls, settings: Any, interface: Interface) -> MultiRLModuleSpec:
+        """See `LeagueAlgorithm.module_spec`."""
+        return MultiRLModuleSpec(
+            rl_module_specs=rl_module_specs(interface, cls.module_class, encoder_settings(settings))
+        )
+
     def setup(self, config: AlgorithmConfig) -> None:
         super().setup(config)
-        settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
+        settings = self.league.training
         assert isinstance(settings, OffPolicyConfig)
         self.settings = settings
         keys = (JOINT,) if issubclass(self.config.env_runner_cls, JointRunner) else tuple(self.config.policies)
@@ -80,13 +101,13 @@ class OffPolicy(LeagueAlgorithm):
 
     def training_step(self) -> None:
         """Sample and learn in rounds until ITERATION_STEPS actions were taken, and log metrics."""
-        seconds = dict.fromkeys((ENV_RUNNER_SAMPLING_TIMER, LEARNER_UPDATE_TIMER, SYNCH_WORKER_WEIGHTS_TIMER), 0.0)
+        seconds = dict.fromkeys((self.sampling_timer, LEARNER_UPDATE_TIMER, SYNCH_WORKER_WEIGHTS_TIMER), 0.0)
         learning = rllib_config.learning_policies(self.settings, tuple(self.config.policies), self.iteration)
         before = self.steps
         target = before + ITERATION_STEPS
         while self.steps < target:
             for timer, part in (
-                (ENV_RUNNER_SAMPLING_TIMER, self._sample),
+                (self.sampling_timer, self._sample),
                 (LEARNER_UPDATE_TIMER, partial(self._learn, learning)),
                 (SYNCH_WORKER_WEIGHTS_TIMER, self._sync_weights),
             ):
@@ -98,7 +119,7 @@ class OffPolicy(LeagueAlgorithm):
         self.metrics.log_value(EXPLORATION, self.exploration, window=1)
         is_local = self.env_runner_group.num_remote_env_runners() == 0
         results = self.env_runner_group.foreach_env_runner(ReplayRunner.get_metrics, local_env_runner=is_local)
-        self.metrics.aggregate(results, key=ENV_RUNNER_RESULTS)
+        self.add_results(results)
         self.exchange_opponents(results, self.steps - before)
         if learned := self._learner.results():
             self.metrics.aggregate([learned], key=LEARNER_RESULTS)
@@ -110,12 +131,19 @@ class OffPolicy(LeagueAlgorithm):
         for key, replay in self.replays.items():
             replay.reseed(derive(self.config.seed or 0, key), steps)
 
-    def draw_sample(self, replay: ReplayBuffer) -> Sample:
-        """Return the sample of one gradient step: transitions, or sequences of them for recurrent networks."""
+    def draw_sample(self, replay: ReplayBuffer, draws: int = 1) -> Sample:
+        """Return concatenated batches: transitions, or sequences of them for recurrent networks."""
         settings = self.settings
+        size, gamma = settings.batch_size, settings.gamma
         if isinstance(settings, QLearningConfig) and (recurrence := settings.recurrence) is not None:
-            return replay.sample_sequences(settings.batch_size, recurrence.sequence, gamma=settings.gamma)
-        return replay.sample(settings.batch_size, n_step=settings.n_step, gamma=settings.gamma, beta=self._beta)
+            return replay.sample_sequences(draws * size, recurrence.sequence, gamma=gamma)
+        priorities = settings.priorities
+        beta = 1.0 if priorities is None else priorities.beta + (1 - priorities.beta) * self.progress.budget
+        return replay.sample(size, draws=draws, n_step=settings.n_step, gamma=gamma, beta=beta)
+
+    def draws_per_step(self, learning: Collection[str]) -> int:  # noqa: ARG002
+        """Return the number of batches that a gradient step takes from each buffer."""
+        return 1
 
     def save_to_path(self, path: str | Path, **kwargs: Any) -> str:
         """Save as RLlib does, and the buffers in addition."""
@@ -165,10 +193,15 @@ class OffPolicy(LeagueAlgorithm):
         ready = [key for key in keys if len(self.replays[key]) >= settings.learning_starts]
         if not ready:
             return
-        for _ in range(settings.updates):
-            samples = {key: self.draw_sample(self.replays[key]) for key in ready}
-            for key, errors in self._learner.learn(samples, learning).items():
-                self.replays[key].prioritize(samples[key].indices, errors)
+        draws = self.draws_per_step(learning)
+        # New priorities affect the next draw.
+        most = 1 if settings.priorities else max(1, ROWS_AT_ONCE // (draws * settings.batch_size))
+        for first in range(0, settings.updates, most):
+            steps = min(most, settings.updates - first)
+            samples = {key: self.draw_sample(self.replays[key], steps * draws) for key in ready}
+            for key, errors in self._learner.learn(samples, learning, steps).items():
+                if settings.priorities:
+                    self.replays[key].prioritize(samples[key].indices, errors.cpu().numpy())
 
     def _sync_weights(self) -> None:
         """Send new weights to the runners. For a local runner, this skips RLlib's way through the object store."""
@@ -181,30 +214,6 @@ class OffPolicy(LeagueAlgorithm):
             weights = {COMPONENT_RL_MODULE: learner.module.get_state(), WEIGHTS_SEQ_NO: learner.updates}
             group.local_env_runner.set_state(weights)
         self._synced_updates = learner.updates
-
-    @property
-    def _beta(self) -> float:
-        priorities = self.settings.priorities
-        if priorities is None:
-            return 1.0
-        return priorities.beta + (1 - priorities.beta) * self.progress.budget
-
-
-def off_policy_config(
-    league: LeagueConfig,
-    interface: Interface,
-    storage: Storage | None,
-    *,
-    modules: MultiRLModuleSpec,
-    learner: type[OffPolicyLearner],
-    runner: type[ReplayRunner] = ReplayRunner,
-    algorithm: type[OffPolicy] = OffPolicy,
-) -> AlgorithmConfig:
-    """Return RLlib's configuration of an off-policy algorithm. Raises what `configure` raises."""
-    config = ExplicitConfig(algo_class=algorithm)
-    configure(config, league, interface, storage, modules=modules, runner=runner, learner=learner)
-    config.training(lr=league.training.lr, gamma=league.training.gamma)
-    return config
 
 
 def starts_with_empty_replay(settings: TrainingSettings, checkpoint: Path) -> bool:

@@ -6,35 +6,28 @@ agents' networks act and are exported; mixers and targets belong to the training
 Adam instead of RMSprop, and feed-forward networks learn from single transitions instead of whole episodes.
 """
 
-from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 
-from league.config.league import LeagueConfig
 from league.config.off_policy import QMIXConfig
 from league.interface import Interface
-from league.settings import Storage
-from training.algorithms.off_policy import off_policy_config
+from training.algorithms.off_policy import OffPolicy
 from training.algorithms.rllib_config import encoder_settings, rl_module_specs
 from training.learners.qmix import QMIXLearner, teams
 from training.modules.qmix import AgentNetwork
 from training.sampling.replay_runner import JointRunner
 
 
-def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storage | None = None) -> AlgorithmConfig:
-    """See `training.algorithms.rllib_config.algorithm_config`."""
-    assert isinstance(league.training, QMIXConfig)
-    return off_policy_config(
-        league,
-        interface,
-        storage,
-        modules=module_spec(league.training, interface),
-        learner=QMIXLearner,
-        runner=JointRunner,
-    )
+class QMIX(OffPolicy):
+    """All policies learn from one buffer of joint transitions."""
 
+    settings_class = QMIXConfig
+    module_class = AgentNetwork
+    learner_class = QMIXLearner
+    runner_class = JointRunner
 
-def module_spec(settings: QMIXConfig, interface: Interface) -> MultiRLModuleSpec:
-    """Return the modules of all policies. Raises ConfigError for agents that cannot be mixed."""
-    teams(settings.groups, interface)
-    model_config = encoder_settings(settings) | {"recurrence": settings.recurrence and settings.recurrence.width}
-    return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, AgentNetwork, model_config))
+    @classmethod
+    def module_spec(cls, settings: QMIXConfig, interface: Interface) -> MultiRLModuleSpec:
+        """Return the modules of all policies. Raises ConfigError for agents that cannot be mixed."""
+        teams(settings.groups, interface)
+        model_config = encoder_settings(settings) | {"recurrence": settings.recurrence and settings.recurrence.width}
+        return MultiRLModuleSpec(rl_module_specs=rl_module_specs(interface, cls.module_class, model_config))

@@ -1,27 +1,90 @@
-"""The RLlib configuration that all algorithms share, and the choice of an algorithm by name."""
+"""The RLlib configuration that all algorithms share, and the choice of an algorithm by name or entry point."""
 
 from collections.abc import Sequence
-from importlib import import_module
+from inspect import isclass
 from typing import Any
 
+from ray import cloudpickle
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
 from ray.rllib.core.learner.learner import Learner
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 
-from league.config.algorithms import AnyTraining
-from league.config.league import LeagueConfig
+from league.config.algorithms import ALGORITHMS, IMPORTED
+from league.config.league import LeagueConfig, typed
+from league.config.off_policy import OffPolicyConfig
 from league.config.ppo import PPOConfig
 from league.config.training import PhaseConfig, TrainingSettings
-from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, check_fast_seeds, implementation
+from league.entry_points import import_entry_point
+from league.environments.implementation import check_fast_seeds
 from league.errors import ConfigError
 from league.interface import Interface
 from league.policies.actions import dist_inputs_size
 from league.results.scoring import scoring
 from league.settings import Storage
+from training.algorithms.league_algorithm import LeagueAlgorithm
+from training.algorithms.resources import resources
 from training.modules.policy_module import PolicyModule
 from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE, BatchedEnvRunner, module_spaces
 from training.sampling.opponent_scores import is_scored
+
+KEY = "training.algorithm"
+PARTS: dict[str, tuple[type, ...]] = {
+    "settings_class": (PPOConfig, OffPolicyConfig),
+    "module_class": (PolicyModule,),
+    "learner_class": (Learner,),
+    "runner_class": (BatchedEnvRunner,),
+}
+"""Attribute of the class of an algorithm → what it is derived from, if no base class has it."""
+
+
+def algorithm_class(name: str) -> type[LeagueAlgorithm]:
+    """Import an algorithm, and no other one.
+
+    Raises ConfigError if there is none, or it lacks one of the PARTS.
+    """
+    entry_point = f"training.algorithms.{name}:{name.upper()}" if name in ALGORITHMS else name
+    imported = import_entry_point(KEY, entry_point)
+    if not (isclass(imported) and issubclass(imported, LeagueAlgorithm)):
+        raise ConfigError(f"{KEY}: {name}: expected a subclass of PPO or OffPolicy of Policy League, got {imported!r}")
+    for part, bases in PARTS.items():
+        present, *inherited = [vars(base)[part] for base in imported.__mro__ if part in vars(base)] or [None]
+        bases = tuple(inherited[:1]) or bases
+        if not (isclass(present) and issubclass(present, bases)):
+            names = " or ".join(base.__name__ for base in bases)
+            raise ConfigError(f"{KEY}: {name}: {part}: expected a subclass of {names}, got {present!r}")
+    return imported
+
+
+def with_algorithm(league: LeagueConfig) -> LeagueConfig:
+    """Return the league with the settings of its algorithm, whose code is imported.
+
+    Raises ConfigError if it cannot be imported, or does not accept the settings.
+    """
+    settings = league.training
+    if settings.algorithm in ALGORITHMS:
+        return league
+    IMPORTED[settings.algorithm] = algorithm_class(settings.algorithm).settings_class
+    try:
+        return league.model_copy(update={"training": typed(settings)})
+    except ValueError as error:
+        raise ConfigError(f"training: {error}") from error
+
+
+class ImportingConfig(AlgorithmConfig):
+    """An AlgorithmConfig that imports the league's algorithm where it is unpickled, before classes of that code."""
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        if self.env_config[LEAGUE]["training"]["algorithm"] in ALGORITHMS:
+            return super().__reduce_ex__(protocol)
+        return _unpickle, (type(self), self.env_config[LEAGUE], cloudpickle.dumps(vars(self)))
+
+
+def _unpickle(cls: type[ImportingConfig], league: dict[str, Any], attributes: bytes) -> ImportingConfig:
+    with_algorithm(LeagueConfig.model_validate(league))
+    config = cls.__new__(cls)
+    config.__dict__.update(cloudpickle.loads(attributes))
+    return config
 
 
 def learning_policies(settings: TrainingSettings, policies: tuple[str, ...], iteration: int) -> tuple[str, ...]:
@@ -83,20 +146,19 @@ def configure(
     league: LeagueConfig,
     interface: Interface,
     storage: Storage | None,
-    *,
-    modules: MultiRLModuleSpec,
-    runner: type[BatchedEnvRunner],
-    learner: type[Learner],
 ) -> None:
     """Set everything in `config` except the algorithm's own hyperparameters.
 
     Raises ConfigError if `policies_to_train`, `opponents` or `seeds` do not fit the league.
     """
-    settings = league.training
+    algorithm: type[LeagueAlgorithm] = config.algo_class
+    settings, used = league.training, resources(league, len(interface.agents))
     check_policies_to_train(settings, interface.policy_ids)
     check_opponents(league, interface)
     if settings.seeds == "fast":
-        check_fast_seeds(league.environment)
+        check_fast_seeds(league.training_environment)
+        if any(stage.is_random for stage in settings.curriculum):
+            raise ConfigError("training.seeds: expected stock, because training.curriculum has random arguments")
     config.environment(
         env_config={
             LEAGUE: league.model_dump(mode="json", by_alias=True),
@@ -108,42 +170,26 @@ def configure(
         policies=interface.policy_ids,  # the order determines seeded weights and minibatches
         policy_mapping_fn=lambda agent, *_, **__: interface.policies[agent],
     )
-    config.rl_module(rl_module_spec=modules)
+    config.rl_module(rl_module_spec=algorithm.module_spec(settings, interface))
     config.env_runners(
-        env_runner_cls=runner,
-        num_env_runners=settings.runners,
-        num_envs_per_env_runner=num_envs(league, len(interface.agents)),
+        env_runner_cls=algorithm.runner_class,
+        num_env_runners=used.runners,
+        num_envs_per_env_runner=used.num_envs,
         num_gpus_per_env_runner=settings.runner_gpus,
         # The runners have no connector state that could be merged.
         merge_env_runner_states=False,
     )
     # The learner runs in the algorithm's process.
     config.learners(
-        learner_class=learner,
+        learner_class=algorithm.learner_class,
         num_learners=0,
-        num_gpus_per_learner=settings.gpus,
+        num_gpus_per_learner=used.gpus,
         add_default_connectors_to_learner_pipeline=False,
     )
     # Report faults of an environment instead of retrying forever; a failed run can be resumed.
     config.fault_tolerance(restart_failed_env_runners=False, ignore_env_runner_failures=False)
     config.debugging(seed=settings.seed, log_level="ERROR")
     config.reporting(min_time_s_per_iteration=0)
-
-
-STEPS_PER_BATCH = 16
-"""Minimum number of steps of an agent in each environment per batch: advantages of shorter chunks are mostly guesses of
-the value function."""
-
-
-def num_envs(league: LeagueConfig, agents: int) -> int:
-    """Return the number of parallel environments of a runner."""
-    settings = league.training
-    if settings.num_envs != "auto":
-        return settings.num_envs
-    if not isinstance(settings, PPOConfig) or implementation(league.environment).vector is None:
-        return STOCK_ENVS
-    fitting = settings.train_batch_size // (max(settings.runners, 1) * agents * STEPS_PER_BATCH)
-    return min(max(fitting, STOCK_ENVS), VECTOR_ENVS)
 
 
 def encoder_settings(settings: TrainingSettings) -> dict[str, Any]:
@@ -153,6 +199,7 @@ def encoder_settings(settings: TrainingSettings) -> dict[str, Any]:
         "convolutions": [(layer.filters, layer.kernel, layer.stride) for layer in settings.convolutions],
         "channels": settings.channels,
         "normalize": settings.normalize_observations,
+        "network": settings.network and (settings.network.entry_point, settings.network.kwargs),
     }
 
 
@@ -184,14 +231,10 @@ def algorithm_config(league: LeagueConfig, interface: Interface, storage: Storag
     Raises:
         ConfigError: The settings do not fit the league.
     """
-    return _module(league.training).algorithm_config(league, interface, storage)
+    league = with_algorithm(league)
+    return algorithm_class(league.training.algorithm).algorithm_config(league, interface, storage)
 
 
-def module_spec(settings: AnyTraining, interface: Interface) -> MultiRLModuleSpec:
+def module_spec(settings: TrainingSettings, interface: Interface) -> MultiRLModuleSpec:
     """Return the PolicyModules of all policies. Raises ConfigError for spaces that the algorithm does not support."""
-    return _module(settings).module_spec(settings, interface)
-
-
-def _module(settings: AnyTraining) -> Any:
-    """Import `training/algorithms/<name>.py`, and no other algorithm."""
-    return import_module(f"training.algorithms.{settings.algorithm}")
+    return algorithm_class(settings.algorithm).module_spec(settings, interface)

@@ -1,4 +1,4 @@
-"""Exports a policy's module to ONNX: one self-contained file with everything needed to act."""
+"""Exports a policy's module to ONNX: one self-contained file with everything needed to act, and one with its value."""
 
 import logging
 import warnings
@@ -9,16 +9,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from onnx.utils import Extractor
 from ray.rllib.core.columns import Columns
 from torch import Tensor, nn
 
 from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
-from league.policies.onnx import ACTION, DIST_INPUTS, LAST_ACTION, STATE_IN, STATE_OUT
+from league.policies.onnx import ACTION, DIST_INPUTS, LAST_ACTION, STATE_IN, STATE_OUT, VALUE
 from league.registry.storage.manifest import Tensor as TensorManifest
 from league.spaces import Box, DictSpace, Discrete, MultiDiscrete, Space, inputs
 from league.spaces.arrays import bounds
+from training.modules.actor_critic import ActorCritic
 from training.modules.policy_module import PREVIOUS_ACTION, PolicyModule
+from training.modules.value_function import ReturnNormalization
 
 BATCH = "batch"
 
@@ -26,25 +29,39 @@ BATCH = "batch"
 class PolicyGraph(nn.Module):
     """The exported module: observations, then states, as positional tensors → (`action`, `action_dist_inputs`, states).
 
-    `action` is greedy and in the agent's action space; it is legal, since the distribution inputs are masked.
+    `action` is greedy and in the agent's action space; it is legal, since the distribution inputs are masked. With an
+    ActorCritic without state, `has_value` adds `value` (B,). scale: its units.
     """
 
-    def __init__(self, module: PolicyModule, observed: tuple[str, ...], action: Space) -> None:
+    def __init__(
+        self,
+        module: PolicyModule,
+        observed: tuple[str, ...],
+        action: Space,
+        has_value: bool = False,
+        scale: ReturnNormalization | None = None,
+    ) -> None:
         super().__init__()
         self.module = module
         self.observed = observed
         self.remembered = tuple(module.get_initial_state())
         assert isinstance(action, Discrete | MultiDiscrete | Box), "module_spec refuses others"
         self.to_environment = ContinuousActions(action) if isinstance(action, Box) else IntegerActions(action)
+        self.has_value = has_value
+        self.deviation, self.mean = (1.0, 0.0) if scale is None else (scale.deviation, float(scale.mean))
 
     def forward(self, *arrays: Tensor) -> tuple[Tensor, ...]:
-        batch = {
-            Columns.OBS: dict(zip(self.observed, arrays, strict=False)),
-            Columns.STATE_IN: dict(zip(self.remembered, arrays[len(self.observed) :], strict=True)),
-        }
-        answer = self.module.greedy_outputs(batch)
+        observations = dict(zip(self.observed, arrays, strict=False))
+        if self.has_value:
+            assert isinstance(self.module, ActorCritic), "others have no value"
+            embeddings = self.module.encoder(observations)
+            answer: dict[str, Any] = self.module.policy_outputs(embeddings, observations)
+            states = [self.module.compute_values({Columns.OBS: observations}, embeddings) * self.deviation + self.mean]
+        else:
+            state = dict(zip(self.remembered, arrays[len(self.observed) :], strict=True))
+            answer = self.module.greedy_outputs({Columns.OBS: observations, Columns.STATE_IN: state})
+            states = [answer[Columns.STATE_OUT][key] for key in self.remembered]
         dist_inputs = answer[Columns.ACTION_DIST_INPUTS]
-        states = [answer[Columns.STATE_OUT][key] for key in self.remembered]
         return self.to_environment(self.module.distribution.mode(dist_inputs)), dist_inputs, *states
 
 
@@ -92,17 +109,35 @@ class ContinuousActions(nn.Module):
         return (spanned if self.is_bounded else torch.where(self.finite, spanned, clipped)).to(self.dtype)
 
 
-def export_policy(module: PolicyModule, spaces: AgentInterface, path: Path) -> None:
-    """Write the graph of `module` to `path`, with the tensors of `graph_tensors` and a dynamic batch size."""
+def export_policy(
+    module: PolicyModule,
+    spaces: AgentInterface,
+    path: Path,
+    value: Path | None = None,
+    scale: ReturnNormalization | None = None,
+) -> None:
+    """Write the graph of `module` to `path`, with the tensors of `graph_tensors` and a dynamic batch size.
+
+    value: where the graph from the same inputs to `action_dist_inputs` and `value` is written; None for no value.
+    scale: the units in which `module` computes it; None for those of the rewards.
+    """
     input_tensors, output_tensors, _ = graph_tensors(module, spaces)
     # Two rows: torch.export treats a batch of one as constant.
     examples = tuple(
         torch.zeros([size or 2 for size in tensor.shape], dtype=_dtype(tensor.dtype)) for tensor in input_tensors
     )
-    graph = PolicyGraph(module, tuple(inputs(spaces.observation)), spaces.action).eval()
-    names = [[tensor.name for tensor in tensors] for tensors in (input_tensors, output_tensors)]
+    graph = PolicyGraph(module, tuple(inputs(spaces.observation)), spaces.action, value is not None, scale).eval()
+    input_names, output_names = ([tensor.name for tensor in tensors] for tensors in (input_tensors, output_tensors))
     dynamic_shapes = (tuple({0: torch.export.Dim(BATCH)} for _ in input_tensors),)
-    onnx_program(graph, examples, *names, dynamic_shapes=dynamic_shapes).save(str(path), external_data=False)
+    if value is None:
+        program = onnx_program(graph, examples, input_names, output_names, dynamic_shapes=dynamic_shapes)
+        program.save(str(path), external_data=False)
+        return
+    # One export, which takes seconds, and two parts of it.
+    program = onnx_program(graph, examples, input_names, [*output_names, VALUE], dynamic_shapes=dynamic_shapes)
+    parts = Extractor(program.model_proto)
+    path.write_bytes(parts.extract_model(input_names, output_names).SerializeToString())
+    value.write_bytes(parts.extract_model(input_names, [DIST_INPUTS, VALUE]).SerializeToString())
 
 
 def onnx_program(

@@ -1,6 +1,7 @@
 """Checks that an exported graph acts as the trained module, on observations from play."""
 
 import itertools
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
@@ -14,17 +15,22 @@ from ray.rllib.core.columns import Columns
 
 from league.config.environment import EnvironmentConfig
 from league.environments.lockstep import stock_stepping
-from league.environments.stepping import Indices, Starts
+from league.environments.stepping import Batch, Indices, Starts
 from league.errors import ParityError
 from league.interface import Interface
 from league.policies.actions import to_environment
+from league.policies.graph_runs import open_session
 from league.policies.onnx import LAST_ACTION, OnnxPolicy
 from league.policies.probes import Probes, excused, same
 from league.random.seeds import derive, generator
 from league.registry.storage.manifest import Parity
-from league.spaces import ACTION_MASK, Space
+from league.spaces import ACTION_MASK, Discrete, Space
+from league.spaces.arrays import tensors
+from league.spaces.conversion import to_gymnasium
 from training.export.onnx_export import state_names
+from training.modules.actor_critic import ActorCritic
 from training.modules.policy_module import PolicyModule
+from training.modules.value_function import ReturnNormalization
 from training.sampling.distributions import distribution
 from training.sampling.env_runner import one_thread
 from training.sampling.recurrent_state import RecurrentStates
@@ -44,15 +50,17 @@ class PlayLimits:
 
     Attributes:
         observations: Of each policy.
-        megabytes: Large observations are limited to this size, but not below MIN_OBSERVATIONS.
-        enough_seconds: Seconds of play after which MIN_OBSERVATIONS suffice.
+        megabytes: Large observations are limited to this size, but not below `least`.
+        enough_seconds: Seconds of play after which `least` observations suffice.
         most_seconds: Seconds after which a policy with fewer has failed.
+        least: Observations that are required.
     """
 
     observations: int
     megabytes: int
     enough_seconds: float
     most_seconds: float
+    least: int = MIN_OBSERVATIONS
 
 
 EXPORTED = PlayLimits(observations=2048, megabytes=128, enough_seconds=8.0, most_seconds=120.0)
@@ -88,6 +96,7 @@ def observed_play(
 ) -> dict[str, list[ObservedBatch]]:
     """Play until each policy has enough observations; return policy → batches of them, with recurrent states.
 
+    For a game that runs in simulators, which may be busy with training, observations are drawn from their spaces.
     In every other environment the policies play, in the rest random actions are taken, to include observations that the
     policies do and do not reach.
 
@@ -102,6 +111,8 @@ def observed_play(
     Raises:
         ParityError: A policy does not act often enough. What `act` raises.
     """
+    if environment.external is not None:
+        return _drawn(interface, initial_states, act, limits, next(seeds))
     policies = interface.policy_ids
     batches: dict[str, list[ObservedBatch]] = {policy: [] for policy in policies}
     began = time.monotonic()
@@ -130,18 +141,49 @@ def observed_play(
     return batches
 
 
+def _drawn(
+    interface: Interface,
+    initial_states: Mapping[str, Mapping[str, NDArray]],
+    act: Acting,
+    limits: PlayLimits,
+    seed: int,
+) -> dict[str, list[ObservedBatch]]:
+    """Return observations drawn uniformly from each policy's space, in sequences with its recurrent states."""
+    rng = generator(seed, "drawn")
+    batches: dict[str, list[ObservedBatch]] = {}
+    for policy in interface.policy_ids:
+        spaces = interface.of_policy(policy)
+        space = to_gymnasium(spaces.observation)
+        space.seed(int(rng.integers(2**31)))
+        states = RecurrentStates(initial_states[policy], NUM_ENVS, 1)
+        envs, agents = np.arange(NUM_ENVS), np.zeros(NUM_ENVS, np.int64)
+        batches[policy] = []
+        for _ in range(math.ceil(limits.least / NUM_ENVS)):
+            rows = [tensors(spaces.observation, space.sample()) for _ in range(NUM_ENVS)]
+            arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+            if (mask := arrays.get(ACTION_MASK)) is not None:
+                mask[:] = not isinstance(spaces.action, Discrete) or rng.random(mask.shape) < 0.5
+                mask[envs, rng.integers(mask.shape[1], size=NUM_ENVS)] = 1
+            batch = Batch(envs, agents, arrays, np.zeros(NUM_ENVS))
+            observed = ObservedBatch(arrays, states.get(batch))
+            batches[policy].append(observed)
+            _, after = act(policy, observed, True)
+            states.update(batch, after)
+    return batches
+
+
 def _is_enough(batches: Mapping[str, list[ObservedBatch]], limits: PlayLimits, seconds: float) -> bool:
     counts = {policy: sum(map(len, observed)) for policy, observed in batches.items()}
-    if seconds > limits.most_seconds and (least := min(counts.values())) < MIN_OBSERVATIONS:
+    if seconds > limits.most_seconds and (count := min(counts.values())) < limits.least:
         rarest = min(counts, key=lambda policy: counts[policy])
         raise ParityError(
-            f"policy {rarest} received {least} observations in {seconds:.0f} s of play, expected {MIN_OBSERVATIONS}"
+            f"policy {rarest} received {count} observations in {seconds:.0f} s of play, expected {limits.least}"
         )
     for policy, observed in batches.items():
-        target = MIN_OBSERVATIONS
+        target = limits.least
         if observed and seconds <= limits.enough_seconds:
             size = sum(array[0].nbytes for array in observed[0].observations.values())
-            target = min(limits.observations, max(MIN_OBSERVATIONS, limits.megabytes * 2**20 // size))
+            target = min(limits.observations, max(limits.least, limits.megabytes * 2**20 // size))
         if counts[policy] < target:
             return False
     return True
@@ -208,6 +250,29 @@ def check_parity(path: Path, policy: str, module: PolicyModule, batches: list[Ob
             f"and by up to {worst:g}, relative to 1 + |x|, in a distribution input or a state"
         )
     return Parity(observations=count, mismatches=mismatches, near_ties=near_ties, max_difference=largest)
+
+
+@one_thread()
+def check_value(
+    path: Path, policy: str, module: ActorCritic, scale: ReturnNormalization | None, batches: list[ObservedBatch]
+) -> None:
+    """Compare the value graph at `path` with `module`, whose values have the units `scale`.
+
+    Raises ParityError if a distribution input or a value differs by more than TOLERANCE.
+    """
+    session, worst = open_session(path.read_bytes()), 0.0
+    for batch in batches:
+        observations = {name: torch.from_numpy(array) for name, array in batch.observations.items()}
+        with torch.no_grad():
+            outputs = module.train_outputs(module.encoder(observations), observations)
+        values = outputs[Columns.VF_PREDS].numpy()
+        expected = outputs[Columns.ACTION_DIST_INPUTS].numpy(), values if scale is None else scale.denormalized(values)
+        for exported, module_output in zip(session.run(None, batch.observations), expected, strict=True):
+            worst = max(worst, float((np.abs(exported - module_output) / (1 + np.abs(module_output))).max()))
+    if not worst <= TOLERANCE:
+        raise ParityError(
+            f"the value graph of policy {policy} differs from its module by {worst:g}, relative to 1 + |x|"
+        )
 
 
 def probes(graph: OnnxPolicy, batches: list[ObservedBatch]) -> Probes:

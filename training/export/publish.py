@@ -1,5 +1,6 @@
 """Publishes a training checkpoint as a version in the registry."""
 
+import pickle
 import shutil
 import subprocess
 from dataclasses import dataclass
@@ -9,16 +10,20 @@ from pathlib import Path
 from ray.rllib.core import COMPONENT_LEARNER, COMPONENT_LEARNER_GROUP, COMPONENT_RL_MODULE
 
 from league.config.league import LeagueConfig
+from league.config.ppo import PPOConfig
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
-from league.registry.storage.manifest import PROBES, TRAINING, Manifest, PolicyManifest, trained_role
+from league.registry.storage.manifest import PROBES, TRAINING, VALUE, Manifest, PolicyManifest, trained_role
 from league.registry.storage.rows import VersionRow
 from league.stack import installed
 from training.algorithms.rllib_config import module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy, graph_tensors
+from training.learners.ppo import SCALES
+from training.modules.actor_critic import ActorCritic
 from training.modules.policy_module import PolicyModule
+from training.modules.value_function import ReturnNormalization
 
 MODULES = Path(COMPONENT_LEARNER_GROUP, COMPONENT_LEARNER, COMPONENT_RL_MODULE)
 """Where an Algorithm's checkpoint stores the modules."""
@@ -85,14 +90,22 @@ def export(
     """
     modules = load_modules(checkpoint.path, config, interface)
     observations = parity.collect_observations(config.environment, interface, modules, seed=config.training.seed)
+    scales = load_scales(checkpoint.path, config)
     policies = {}
     for policy, module in modules.items():
         spaces, file, probes = interface.of_policy(policy), f"{policy}.onnx", f"{policy}{PROBES}"
-        export_policy(module, spaces, directory / file)
+        # Values can be exported if they depend on one observation only.
+        is_own = isinstance(config.training, PPOConfig) and config.training.critic == "own"
+        critic = module if is_own and isinstance(module, ActorCritic) and module.recurrent is None else None
+        scale = scales.get(policy)
+        value = None if critic is None else f"{policy}{VALUE}"
+        export_policy(module, spaces, directory / file, None if value is None else directory / value, scale)
         inputs, outputs, state = graph_tensors(module, spaces)
         proof = parity.check_parity(directory / file, policy, module, observations[policy], spaces.action)
         policy_probes = parity.probes(OnnxPolicy(directory / file), observations[policy])
         (directory / probes).write_bytes(policy_probes.to_bytes())
+        if critic is not None and value is not None:
+            parity.check_value(directory / value, policy, critic, scale, observations[policy])
         policies[policy] = PolicyManifest(
             file=file,
             observation=spaces.observation,
@@ -102,6 +115,7 @@ def export(
             state=state,
             parity=proof,
             probes=probes,
+            value=value,
         )
     return Manifest(
         league=config.league,
@@ -128,6 +142,17 @@ def load_modules(checkpoint: Path, config: LeagueConfig, interface: Interface) -
     modules = module_spec(config.training, interface).build()
     modules.restore_from_path(checkpoint / MODULES)
     return {policy: modules[policy] for policy in interface.policy_ids}
+
+
+def load_scales(checkpoint: Path, config: LeagueConfig) -> dict[str, ReturnNormalization]:
+    """Return the units of values, by policy, in the state of `checkpoint`. Reads a pickle, as `load_modules` does."""
+    if not (isinstance(config.training, PPOConfig) and config.training.normalize_values):
+        return {}
+    state = pickle.loads((checkpoint / MODULES.parent / "state.pkl").read_bytes())
+    scales = {policy: ReturnNormalization() for policy in state[SCALES]}
+    for policy, scale in scales.items():
+        scale.load_state_dict(state[SCALES][policy])
+    return scales
 
 
 def git_commit(config_path: Path | None) -> str | None:

@@ -25,8 +25,9 @@ from onnx import AttributeProto, NodeProto, TensorProto, TypeProto, helper, nump
 from league.errors import InvalidInput, one_line
 from league.interface import AgentInterface
 from league.policies.graph_runs import open_session
-from league.policies.policy import MAX_BATCH, MAX_DECODED_BYTES
+from league.policies.policy import MAX_BATCH
 from league.spaces import inputs
+from league.spaces.binary_leaves import MAX_DECODED_BYTES
 from training.importing.graph_mapping import GraphMapping, graph_inputs
 
 MAX_TENSOR, MAX_MEMORY = 2**30, 2 * 2**30

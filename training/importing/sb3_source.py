@@ -1,6 +1,10 @@
-"""Import of a file of Stable-Baselines3: PPO, A2C and DQN with one Box observation, and TD3, DDPG and SAC actors."""
+"""Import of a file of Stable-Baselines3 or sb3-contrib: PPO, MaskablePPO, A2C and DQN with one Box observation, and
+TD3, DDPG and SAC actors.
+"""
 
+import inspect
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +22,8 @@ from training.importing.torch_source import Examples, converted
 
 OUTPUT = "output"
 FORMATS = ("PPO", "A2C", "DQN", "TD3", "DDPG", "SAC")
+MASKABLE = "MaskablePPO"
+"""Of sb3-contrib."""
 
 
 class Logits(nn.Module):
@@ -72,13 +78,14 @@ class PredictOriginal:
     def __init__(self, model: Any, graph: nn.Module, mapping: GraphMapping, spaces: AgentInterface) -> None:
         self._model, self._graph, self._kind, self._spaces = model, graph, mapping.kind, spaces
         self._transpose = mapping.inputs[OBSERVATION].transpose
+        self._takes_masks = "action_masks" in inspect.signature(model.predict).parameters
 
     def initial_state(self, rows: int) -> State:  # noqa: ARG002
         """Return no state."""
         return {}
 
     def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
-        """Call `predict`. With a mask, which Stable-Baselines3 does not know, the best legal logit decides."""
+        """Call `predict`, with the mask if it takes one. Otherwise the best legal logit decides."""
         observation = observations[OBSERVATION]
         if self._transpose:
             observation = observation.transpose(0, *(axis + 1 for axis in self._transpose))
@@ -88,10 +95,12 @@ class PredictOriginal:
             with torch.no_grad():
                 logits = self._graph(torch.from_numpy(observation.astype(np.float32))).numpy()
         action, mask = self._spaces.action, observations.get(ACTION_MASK)
-        if mask is not None and logits is not None:
+        if mask is not None and logits is not None and not self._takes_masks:
             assert isinstance(action, Discrete)
             return np.where(mask != 0, logits, -np.inf).argmax(axis=1) + action.start, logits, state
-        actions, _ = self._model.predict(observation.astype(self._model.observation_space.dtype), deterministic=True)
+        masks = {} if mask is None or not self._takes_masks else {"action_masks": mask != 0}
+        observation = observation.astype(self._model.observation_space.dtype)
+        actions, _ = self._model.predict(observation, deterministic=True, **masks)
         assert not isinstance(action, DictSpace)
         if isinstance(action, Discrete) and self._model.action_space.start != action.start:
             actions = actions - self._model.action_space.start + action.start
@@ -154,6 +163,11 @@ def _load(path: Path) -> Any:
         from stable_baselines3.common.save_util import load_from_zip_file
     except ImportError as error:
         raise ConfigError(f"--sb3 requires Stable-Baselines3: pip install 'policy-league[sb3]' ({error})") from error
+    algorithm_classes = {name: getattr(stable_baselines3, name) for name in FORMATS}
+    with suppress(ImportError):
+        import sb3_contrib
+
+        algorithm_classes[MASKABLE] = sb3_contrib.MaskablePPO
     try:
         data, _, _ = load_from_zip_file(path, device="cpu", load_data=True)
     except Exception as error:
@@ -161,12 +175,14 @@ def _load(path: Path) -> Any:
     policy_class = str(getattr((data or {}).get("policy_class"), "__module__", ""))
     algorithms = [name for name in FORMATS if f".{name.lower()}." in policy_class]
     candidates = algorithms or (["PPO", "A2C"] if "common.policies" in policy_class else [])
+    if ".maskable." in policy_class:
+        candidates = [MASKABLE]
     for name in candidates:
         try:
-            return getattr(stable_baselines3, name).load(path, device="cpu")
+            return algorithm_classes[name].load(path, device="cpu")
         except Exception as error:
             problem = one_line(error)
     raise ConfigError(
         f"{path}: cannot be loaded: {problem if candidates else f'policy of {policy_class or None}'}; "
-        f"supported: {', '.join(FORMATS)}"
+        f"supported: {', '.join(FORMATS)}, and {MASKABLE} of sb3-contrib, which must be installed for it"
     )

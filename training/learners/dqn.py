@@ -35,7 +35,7 @@ class DQNLearner(OffPolicyLearner):
         assert isinstance(network, QNetwork)
         observations, actions = subcolumns(batch.rows, OBSERVATIONS), batch.rows[ACTIONS]
         counted = batch.weights > 0
-        network.encoder.update_statistics({name: column[counted] for name, column in observations.items()})
+        network.encoder.update_statistics(observations, counted)
         hidden, after = self._hidden(network, batch.rows)
         outputs = _chosen(network.head_outputs(observations, noise=True, hidden=hidden), actions)
         rewards, discounts, terminated = (batch.rows[name] for name in (REWARDS, DISCOUNTS, TERMINATED))
@@ -51,11 +51,15 @@ class DQNLearner(OffPolicyLearner):
         else:
             values = (outputs.detach().softmax(-1) * network.atoms).sum(-1)
             losses = errors = -(targets * outputs.log_softmax(-1)).sum(-1)  # cross-entropies
+        number, sizes = counted.sum(), errors.detach().abs()
         return ReplayLoss(
-            total=(batch.weights * losses)[counted].mean(),
-            errors=errors.abs(),
+            total=(batch.weights * losses).sum() / number,
+            errors=sizes,
             networks=(policy,),
-            statistics={"value": values[counted].mean(), "error": errors[counted].abs().mean()},
+            statistics={
+                "value": (values.detach() * counted).sum() / number,
+                "error": (sizes * counted).sum() / number,
+            },
         )
 
     def _hidden(self, network: QNetwork, rows: Mapping[str, Tensor]) -> Hidden:
@@ -92,4 +96,5 @@ class DQNLearner(OffPolicyLearner):
 
 
 def _chosen(answers: Tensor, actions: Tensor) -> Tensor:
-    return answers[torch.arange(len(actions)), actions]
+    """Return the answers (k, n, …) for actions (k,)."""
+    return answers.take_along_dim(actions.reshape(-1, *[1] * (answers.ndim - 1)), dim=1).squeeze(1)

@@ -8,14 +8,13 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from league.config.off_policy import MADDPGConfig
 from training.learners.off_policy import OffPolicyLearner, ReplayBatch, bootstrapped_returns
 from training.modules.maddpg import Actor, Critic
-from training.replay_buffer import DISCOUNTS, NEXT, Sample, subcolumns
-from training.sampling.closed_transitions import ACTIONS, OBSERVATIONS, PRESENT, REWARDS, TERMINATED
+from training.replay_buffer import DISCOUNTS, NEXT, subcolumns
+from training.sampling.closed_transitions import ACTIONS, JOINT, OBSERVATIONS, PRESENT, REWARDS, TERMINATED
 from training.sampling.env_runner import module_spaces
 
 
@@ -62,7 +61,7 @@ def critic_name(policy: str) -> str:
 
 
 class MADDPGLearner(OffPolicyLearner):
-    """Learns from samples of joint transitions, one for each learning policy."""
+    """Learns from joint transitions; the rows of a step are divided among the learning policies."""
 
     settings: MADDPGConfig
 
@@ -92,15 +91,11 @@ class MADDPGLearner(OffPolicyLearner):
             )
         return critics
 
-    def learn(self, samples: Mapping[str, Sample], learning: Collection[str]) -> dict[str, NDArray]:
-        """Update the critics and actors of `learning`. samples: policy id → its own sample of joint transitions."""
-        errors = {
-            policy: self._learn(policy, self.batch(samples[policy])).cpu().numpy()
-            for policy in self.interface.policy_ids
-            if policy in learning
-        }
-        self.update_targets()
-        return errors
+    def step(self, batches: Mapping[str, ReplayBatch], learning: Collection[str]) -> dict[str, Tensor]:
+        """Update the critics and actors of `learning`, each on its own part of the joint transitions."""
+        policies = [policy for policy in self.interface.policy_ids if policy in learning]
+        parts = zip(policies, batches[JOINT].split(len(policies)), strict=True)
+        return {JOINT: torch.cat([self._learn(policy, batch) for policy, batch in parts])}
 
     def set_exploration(self, deviation: float) -> None:
         """Store the runners' current noise deviation in the actors, from where it is exported."""
@@ -129,9 +124,14 @@ class MADDPGLearner(OffPolicyLearner):
         norm = self.gradient_step(policy_loss, [policy])[policy]
         errors = (values.detach() - targets).abs() * present.flatten()
         self.log_statistics(
-            policy, loss=loss, value=values.mean(), error=errors.mean(), critic_gradient_norm=critic_norm
+            policy,
+            loss=loss,
+            value=values.mean(),
+            error=errors.mean(),
+            critic_gradient_norm=critic_norm,
+            policy_loss=policy_loss,
+            gradient_norm=norm,
         )
-        self.log_statistics(policy, policy_loss=policy_loss, gradient_norm=norm)
         return errors.reshape(len(order), -1).amax(0)
 
     def policy_loss(

@@ -25,8 +25,9 @@ from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import Box
-from training.learners.train_batch import PASS_ROWS, TrainBatch
+from training.learners.train_batch import TrainBatch
 from training.modules.policy_module import MASKED_LOGIT
+from training.sampling.episode_chunks import PASS_ROWS
 
 State = dict[str, dict[str, Any]]
 """Policy id → weights."""

@@ -1,19 +1,19 @@
 """Base of the learners that sample from replay buffers: targets of Q-learning, and target networks.
 
 A subclass implements `losses`, and `extra_networks` if it has mixers or critics. One with several backward passes
-overrides `learn`, using `gradient_step`, `update_targets` and `log_statistics`.
+overrides `step`, using `gradient_step` and `log_statistics`. Steps do not wait for a GPU: they read no values of
+tensors, and no shape depends on them.
 """
 
 import copy
-from collections import defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from numpy.typing import NDArray
 from ray.rllib.utils.metrics import WEIGHTS_SEQ_NO
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from league.config.league import LeagueConfig
 from league.config.off_policy import OffPolicyConfig
@@ -99,6 +99,14 @@ class ReplayBatch:
     rows: dict[str, Tensor]
     weights: Tensor
 
+    def split(self, parts: int) -> list["ReplayBatch"]:
+        """Divide the rows equally."""
+        rows = {name: column.chunk(parts) for name, column in self.rows.items()}
+        return [
+            ReplayBatch({name: columns[part] for name, columns in rows.items()}, weights)
+            for part, weights in enumerate(self.weights.chunk(parts))
+        ]
+
 
 @dataclass(frozen=True, slots=True)
 class ReplayLoss:
@@ -138,8 +146,10 @@ class OffPolicyLearner(FixedPoliciesLearner):
         self.interface = Interface.model_validate(self.config.env_config[INTERFACE])
         self.updates = 0
         keep_memory()
-        self._statistics: dict[str, dict[str, list[Tensor]]] = defaultdict(lambda: defaultdict(list))
+        # Key → names of statistics, and their sums over gradient steps with the number of these.
+        self._statistics: dict[str, tuple[tuple[str, ...], Tensor]] = {}
         super().build()
+        self._one = torch.ones((), device=self.device)
 
     def configure_optimizers(self) -> None:
         """Create the extra networks, the targets, and the optimisers."""
@@ -147,25 +157,43 @@ class OffPolicyLearner(FixedPoliciesLearner):
         self.networks |= {name: network.to(self.device) for name, network in self.extra_networks().items()}
         self.targets = {name: copy.deepcopy(net).requires_grad_(False) for name, net in self.networks.items()}
         self._optimizers: dict[str, ClippedAdam] = {}
-        for name, network in self.networks.items():
-            parameters = list(network.parameters())
+        self._parameters = {name: list(network.parameters()) for name, network in self.networks.items()}
+        for name, parameters in self._parameters.items():
             optimizer = ClippedAdam(parameters, lr=self.settings.lr, max_norm=self.settings.grad_clip)
             self.register_optimizer(module_id=name, optimizer=optimizer, params=parameters)
             self._optimizers[name] = optimizer
+        self._target_parameters = [parameter for net in self.targets.values() for parameter in net.parameters()]
+        self._target_buffers = [
+            (old, new)
+            for name, target in self.targets.items()
+            for old, new in zip(target.buffers(), self.networks[name].buffers(), strict=True)
+        ]
+        self._interpolate = get_ema_multi_avg_fn(1 - self.settings.target_rate)
 
     def compute_loss_for_module(self, **_: Any) -> Tensor:
         """Raise NotImplementedError. RLlib calls this from its own `update` only; see `learn`."""
         raise NotImplementedError("off-policy learners learn from samples of replay buffers")
 
-    def learn(self, samples: Mapping[str, Sample], learning: Collection[str]) -> dict[str, NDArray]:
-        """Take one gradient step on the samples. Returns buffer key → errors (k,), for its priorities."""
-        losses = self.losses({key: self.batch(sample) for key, sample in samples.items()}, learning)
+    def learn(self, samples: Mapping[str, Sample], learning: Collection[str], steps: int = 1) -> dict[str, Tensor]:
+        """Take gradient steps, each on the next of as many equal parts of the samples, and update targets when due.
+
+        Returns buffer key → |TD error| or another measure for the priorities of all rows, on the learner's device.
+        """
+        parts = {key: self.batch(sample).split(steps) for key, sample in samples.items()}
+        errors = []
+        for number in range(steps):
+            errors.append(self.step({key: batches[number] for key, batches in parts.items()}, learning))
+            self.update_targets()
+        return {key: torch.cat([of_step[key] for of_step in errors]) for key in samples}
+
+    def step(self, batches: Mapping[str, ReplayBatch], learning: Collection[str]) -> dict[str, Tensor]:
+        """Take one gradient step. Returns buffer key → errors (k,)."""
+        losses = self.losses(batches, learning)
         networks = {name for loss in losses.values() for name in loss.networks}
         norms = self.gradient_step(torch.stack([loss.total for loss in losses.values()]).sum(), networks)
         for key, loss in losses.items():
             self.log_statistics(key, loss=loss.total, gradient_norm=norms[loss.networks[0]], **loss.statistics)
-        self.update_targets()
-        return {key: loss.errors.detach().cpu().numpy() for key, loss in losses.items()}
+        return {key: loss.errors.detach() for key, loss in losses.items()}
 
     def batch(self, sample: Sample) -> ReplayBatch:
         """Move a sample to the learner's device."""
@@ -178,7 +206,7 @@ class OffPolicyLearner(FixedPoliciesLearner):
         Gradients that are not finite are dropped. Returns network → gradient norm.
         """
         names = [name for name in self.networks if name in networks]
-        parameters = [parameter for name in names for parameter in self.networks[name].parameters()]
+        parameters = [parameter for name in names for parameter in self._parameters[name]]
         gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
@@ -191,27 +219,32 @@ class OffPolicyLearner(FixedPoliciesLearner):
         self.weights_version = self.updates
         if self.updates % self.settings.target_every:
             return
-        for name, target in self.targets.items():
-            network, rate = self.networks[name], self.settings.target_rate
-            for old, new in zip(target.parameters(), network.parameters(), strict=True):
-                old.lerp_(new, rate)
-            for old_buffer, new_buffer in zip(target.buffers(), network.buffers(), strict=True):
-                old_buffer.copy_(new_buffer)
+        parameters = [parameter for network in self._parameters.values() for parameter in network]
+        self._interpolate(self._target_parameters, parameters, None)
+        for old, new in self._target_buffers:
+            old.copy_(new)
 
     def log_statistics(self, key: str, **statistics: Tensor) -> None:
         """Add scalars of a gradient step to the reported means. key: a policy id or a buffer key."""
-        for name, value in statistics.items():
-            self._statistics[key][name].append(value.detach())
+        row = torch.stack([*statistics.values(), self._one]).detach()
+        if key in self._statistics:
+            self._statistics[key][1].add_(row)
+        else:
+            self._statistics[key] = tuple(statistics), row
 
     def results(self) -> dict[str, Any]:
         """Return buffer key → means over the gradient steps since the last call, for those that learned."""
-        noted, self._statistics = self._statistics, defaultdict(lambda: defaultdict(list))
-        for key, statistics in noted.items():
-            means = {name: float(torch.stack(values).mean()) for name, values in statistics.items()}
-            self.metrics.log_dict(means, key=key, window=1)
+        learned = []
+        for key, (names, sums) in self._statistics.items():
+            *totals, steps = sums.tolist()
+            if steps:
+                means = {name: total / steps for name, total in zip(names, totals, strict=True)}
+                self.metrics.log_dict(means, key=key, window=1)
+                learned.append(key)
+            sums.zero_()
         warn_of_dropped_gradients(self._optimizers)
         metrics = self.metrics.reduce()
-        return {key: metrics[key] for key in noted}
+        return {key: metrics[key] for key in learned}
 
     def get_state(
         self,

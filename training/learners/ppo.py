@@ -1,10 +1,12 @@
 """The PPO learner: the clipped surrogate loss and the update loop that minimises it."""
 
+import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
+import gymnasium
 import torch
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis.value_function_api import ValueFunctionAPI
@@ -19,7 +21,7 @@ from league.interface import Interface
 from training.learners.magnet import Magnet, Previous, magnet, states
 from training.learners.optimizer import ClippedAdam, warn_of_dropped_gradients
 from training.learners.processor import fast_products, keep_memory
-from training.learners.teacher import Teacher
+from training.learners.ranks import ALONE, Rank
 from training.learners.train_batch import (
     Bootstraps,
     Minibatch,
@@ -30,10 +32,15 @@ from training.learners.train_batch import (
 )
 from training.modules.actor_critic import SharedEncoder
 from training.modules.distributions import TorchDistribution
+from training.modules.encoder import Encoder
+from training.modules.value_function import CentralCritic, ReturnNormalization
 from training.rllib_compat import FixedPoliciesLearner, TrainingData, includes_component
+from training.sampling.central_observations import central_space
 from training.sampling.env_runner import INTERFACE, LEAGUE, STORAGE
 from training.sampling.episode_chunks import EpisodeChunks
 
+WARM_UP = 2**20
+"""Actions, including those of parent versions, over which the learning rate of larger batches grows."""
 NOT_STARTED = ScheduleProgress(steps=0, budget=0.0)
 
 
@@ -48,6 +55,16 @@ class Hyperparameters:
     entropy: float
 
 
+def learning_rate_factor(settings: PPOConfig, progress: ScheduleProgress) -> float:
+    """Return by what the learning rates are multiplied for larger batches: from 1 to √batch_scale.
+
+    Adam's steps are noisy by 1/√size (Malladi et al., 2022, "On the SDEs and scaling rules for adaptive gradient
+    algorithms", arXiv 2205.10287). The factor grows linearly over WARM_UP actions, as gradients change fast at first.
+    """
+    scale = 1 if settings.batch_scale == "auto" else settings.batch_scale
+    return 1 + (math.sqrt(scale) - 1) * min(progress.steps / WARM_UP, 1.0)
+
+
 def hyperparameters(
     settings: PPOConfig, policies: tuple[str, ...], progress: ScheduleProgress = NOT_STARTED
 ) -> dict[str, Hyperparameters]:
@@ -55,11 +72,12 @@ def hyperparameters(
     for policy in settings.per_policy:
         if policy not in policies:
             raise ConfigError(f"training.per_policy.{policy}: unknown policy; the league has {', '.join(policies)}")
-    names = [field.name for field in fields(Hyperparameters)]
-    return {
+    names, factor = [field.name for field in fields(Hyperparameters)], learning_rate_factor(settings, progress)
+    values = {
         policy: Hyperparameters(**{name: scheduled_value(_setting(settings, policy, name), progress) for name in names})
         for policy in policies
     }
+    return {policy: replace(value, lr=value.lr * factor) for policy, value in values.items()}
 
 
 def scheduled_hyperparameters(settings: PPOConfig, policy: str) -> tuple[str, ...]:
@@ -73,20 +91,24 @@ def _setting(settings: PPOConfig, policy: str, name: str) -> Scheduled:
 
 
 class PPOLoss(NamedTuple):
-    """Scalar parts of the loss; only `total` is meant for gradients."""
+    """Scalar parts of the loss, and the gradient of their weighted sum."""
 
-    total: Tensor
     policy: Tensor
     value: Tensor
     entropy: Tensor
     clip_fraction: Tensor
     """Fraction of the steps whose probability ratio is outside the clip range."""
-    magnet_kl: Tensor
-    """Mean divergence from the magnet's reference policy; 0 without a magnet."""
-    teacher: Tensor
-    """Mean cross-entropy of the teacher's actions; 0 without a teacher."""
+    magnet_kl: Tensor | None
+    """Mean divergence from the magnet's reference policy."""
+    teacher: Tensor | None
+    """Mean cross-entropy of the teacher's actions."""
+    outputs: tuple[Tensor, Tensor]
+    """The module's outputs: the inputs of the action distribution, (k, d), and the values, (k,)."""
+    gradients: tuple[Tensor, Tensor]
+    """The gradient by each output, times the minibatch's fraction of the steps of all learners."""
 
 
+@torch.no_grad()
 def ppo_loss(
     minibatch: Minibatch,
     dist_inputs: Tensor,
@@ -106,7 +128,12 @@ def ppo_loss(
             + c_m mean(KL(π ‖ ρ)) − c_t mean(log π(b|s))
 
     Schulman et al., 2017, "Proximal policy optimization algorithms", arXiv 1707.06347, equations 7 and 9. The last
-    terms: see `training.learners.magnet` and `training.learners.teacher`.
+    terms: see `training.learners.magnet` and `training.sampling.teacher`.
+
+    The gradient is computed by its formula, since automatic differentiation takes longer than these operations. Of a
+    step,
+
+        ∂L/∂ log π(a|s) = −r A / k, or 0 where the clipped term is the smaller one,    ∂L/∂V = 2 c_v (V − V_target) / k
 
     Args:
         minibatch: k steps.
@@ -122,19 +149,30 @@ def ppo_loss(
     log_p, entropies = distribution.evaluate(dist_inputs, minibatch.actions)
     ratio = torch.exp(log_p - minibatch.log_p)
     clipped = ratio.clamp(1 - clip, 1 + clip)
-    policy = -torch.minimum(ratio * minibatch.advantages, clipped * minibatch.advantages).mean()
-    value = (values - minibatch.targets).square().mean()
-    mean_entropy = entropies.mean()
-    total = policy + value_loss * value - entropy * mean_entropy
-    magnet_kl = torch.zeros_like(total)
+    surrogate, bound = ratio * minibatch.advantages, clipped * minibatch.advantages
+    error = values - minibatch.targets
+    share = minibatch.fraction / len(values)
+    by_log_p = torch.where(surrogate > bound, 0.0, surrogate) * -share
+    gradient = distribution.gradient(dist_inputs, minibatch.actions, by_log_p, -entropy * share)
+    magnet_kl = cross_entropy = None
     if minibatch.magnet is not None:
         magnet_kl = distribution.divergence(dist_inputs, minibatch.magnet).mean()
-        total = total + magnet * magnet_kl
-    cross_entropy = torch.zeros_like(total)
+        gradient = gradient + magnet * share * distribution.divergence_gradient(dist_inputs, minibatch.magnet)
     if minibatch.taught is not None:
-        cross_entropy = -distribution.evaluate(dist_inputs, minibatch.taught)[0].mean()
-        total = total + teacher * cross_entropy
-    return PPOLoss(total, policy, value, mean_entropy, (clipped != ratio).float().mean(), magnet_kl, cross_entropy)
+        taught_log_p, _ = distribution.evaluate(dist_inputs, minibatch.taught)
+        cross_entropy = -taught_log_p.mean()
+        by_taught_log_p = torch.full_like(taught_log_p, -teacher * share)
+        gradient = gradient + distribution.gradient(dist_inputs, minibatch.taught, by_taught_log_p, 0.0)
+    return PPOLoss(
+        policy=-torch.minimum(surrogate, bound).mean(),
+        value=error.square().mean(),
+        entropy=entropies.mean(),
+        clip_fraction=(clipped != ratio).mean(dtype=torch.float32),
+        magnet_kl=magnet_kl,
+        teacher=cross_entropy,
+        outputs=(dist_inputs, values),
+        gradients=(gradient, error * (2 * value_loss * share)),
+    )
 
 
 MAGNET_KL, MAGNET_WEIGHT = "magnet_kl", "magnet_weight"
@@ -145,11 +183,15 @@ STATISTICS = ("policy_loss", "vf_loss", "entropy", "clip_fraction", "gradient_no
 """Logged per policy: means over the minibatches of an update."""
 EXPLAINED_VARIANCE = "vf_explained_var"
 KL = "kl"
-"""Mean Kullback–Leibler divergence between the policies before and after an update."""
+"""Mean Kullback–Leibler divergence of the policy after an update from the one that sampled, lag + 1 updates before."""
 SCHEDULES = {"lr": "lr", "clip": "clip", "entropy": "entropy_coefficient"}
 """Hyperparameters that can have a schedule → their metrics, which are logged only then."""
 MAGNET = "magnet"
 """Key of the magnet's snapshot in the state."""
+CRITIC = ".critic"
+"""Follows the policy's id in the name of a central critic's optimiser; policy ids contain no dot."""
+CRITICS, SCALES = "critics", "scales"
+"""Keys of the central critics and the units of returns in the state."""
 KL_STEPS = 1024
 """Number of steps for estimating the divergence."""
 ADAM_EPSILON = 1e-5
@@ -166,29 +208,34 @@ class PPOLearner(FixedPoliciesLearner):
 
     bootstraps: Bootstraps = staticmethod(bootstrap_unless_terminated)
     """Selects the chunks whose last observation is bootstrapped from."""
+    rank: Rank = ALONE
+    """The place among the learners of the run. All call `update` with the same arguments, from the same state."""
 
     def build(self) -> None:
-        settings = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).training
+        league = LeagueConfig.model_validate(self.config.env_config[LEAGUE])
+        interface = Interface.model_validate(self.config.env_config[INTERFACE])
+        settings = league.training
         assert isinstance(settings, PPOConfig)
         self.settings = settings
+        self._central = (
+            {} if settings.critic == "own" else central_space(settings.critic, league.environment, interface)
+        )
         self._set_hyperparameters(NOT_STARTED)
         keep_memory()
         super().build()
-        interface = Interface.model_validate(self.config.env_config[INTERFACE])
         storage = self.config.env_config.get(STORAGE)
         self._magnet: Magnet | None = None
         if settings.magnet is not None:
             self._magnet = magnet(settings.magnet, self.module, interface, storage)
-        self._teacher: Teacher | None = None
-        if settings.teacher is not None:
-            self._teacher = Teacher(settings.teacher, interface, storage, settings.seed)
 
     @classmethod
     def rl_module_required_apis(cls) -> list[type]:
         return [ValueFunctionAPI]
 
     def configure_optimizers(self) -> None:
-        """Create an Adam optimiser for each policy's own parameters, and one for a shared encoder."""
+        """Create what values need besides the modules, and an Adam optimiser for each policy's own parameters, for each
+        central critic, and for a shared encoder.
+        """
         shared = self.module.encoder if isinstance(self.module, SharedEncoder) else None
         common = list(shared.parameters()) if shared is not None else []
         self._optimizers: dict[str, ClippedAdam] = {}
@@ -199,6 +246,23 @@ class PPOLearner(FixedPoliciesLearner):
             self._add_optimizer(policy, own_parameters)
         if common:
             self._add_optimizer(ALL_MODULES, common)
+        self._critics: dict[str, CentralCritic] = {}
+        if self._central:
+            convolutions = [(layer.filters, layer.kernel, layer.stride) for layer in self.settings.convolutions]
+            for policy, module in self.module.items():
+                space = gymnasium.spaces.Dict({**module.observation_space.spaces, **self._central})
+                encoder = Encoder(
+                    space,
+                    self.settings.hidden,
+                    convolutions,
+                    self.settings.normalize_observations,
+                    self.settings.channels,
+                )
+                self._critics[policy] = CentralCritic(encoder).to(self.device)
+        for policy, critic in self._critics.items():
+            self._add_optimizer(policy + CRITIC, list(critic.parameters()))
+        normalizes = self.settings.normalize_values
+        self._scales = {policy: ReturnNormalization() for policy, _ in self.module.items() if normalizes}
 
     def update(
         self,
@@ -230,7 +294,8 @@ class PPOLearner(FixedPoliciesLearner):
             batches = self._batches(training_data.episodes, self.module.keys() if policies is None else policies)
             if batches:
                 size = minibatch_size or max(len(batch) for batch in batches.values())
-                self._log(batches, self._gradient_steps(minibatches(batches, size=size, epochs=num_epochs)))
+                drawn = minibatches(batches, size=size, epochs=num_epochs, rank=self.rank)
+                self._log(batches, self._gradient_steps(drawn))
                 warn_of_dropped_gradients(self._optimizers)
         metrics = self.metrics.reduce()
         # RLlib reports NaN for policies that were logged earlier but not in this update.
@@ -242,24 +307,30 @@ class PPOLearner(FixedPoliciesLearner):
             optimizer.param_groups[0]["lr"] = self._lr(name)
         statistics = defaultdict(list)
         for minibatch in drawn:
-            for optimizer in self._optimizers.values():
-                optimizer.zero_grad()
             answers = self.module.forward_train({policy: steps.inputs for policy, steps in minibatch.items()})
             losses = {
                 policy: self.compute_loss_for_module(module_id=policy, batch=steps, fwd_out=answers[policy])
                 for policy, steps in minibatch.items()
             }
-            torch.autograd.backward([loss.total for loss in losses.values()])
-            names = [name for name in self._optimizers if name in minibatch or name == ALL_MODULES]
+            torch.autograd.backward(
+                [output for loss in losses.values() for output in loss.outputs],
+                [gradient for loss in losses.values() for gradient in loss.gradients],
+            )
+            if self.rank.count > 1:
+                groups = [group for optimizer in self._optimizers.values() for group in optimizer.param_groups]
+                self.rank.add([p.grad for group in groups for p in group["params"] if p.grad is not None])
+            names = [name for name in self._optimizers if name.removesuffix(CRITIC) in minibatch or name == ALL_MODULES]
             norms = {name: self._optimizers[name].clip_and_step() for name in names}
             for policy, loss in losses.items():
-                row = torch.stack([*loss[1:-2], norms[policy], loss.magnet_kl, loss.teacher])
-                statistics[policy].append(row.detach())
+                further = [part for part in (loss.magnet_kl, loss.teacher) if part is not None]
+                row = torch.stack([loss.policy, loss.value, loss.entropy, loss.clip_fraction, norms[policy], *further])
+                statistics[policy].append(row if self.rank.count == 1 else row * minibatch[policy].fraction)
+        self.rank.add([row for rows in statistics.values() for row in rows])
         return statistics
 
     def _set_hyperparameters(self, progress: ScheduleProgress) -> None:
         self.hyperparameters = hyperparameters(self.settings, tuple(self.config.policies), progress)
-        self._common_lr = scheduled_value(self.settings.lr, progress)
+        self._common_lr = scheduled_value(self.settings.lr, progress) * learning_rate_factor(self.settings, progress)
         self._magnet_weight = scheduled_value(self.settings.magnet.weight, progress) if self.settings.magnet else 0.0
         self._teacher_weight = scheduled_value(self.settings.teacher.weight, progress) if self.settings.teacher else 0.0
 
@@ -280,11 +351,14 @@ class PPOLearner(FixedPoliciesLearner):
                 lambda_=self.hyperparameters[policy].lambda_,
                 sequence=recurrence.sequence if recurrence else None,
                 bootstraps=self.bootstraps,
+                critic=self._critics.get(policy),
+                scale=self._scales.get(policy),
             )
             if self._magnet is not None:
                 batch = replace(batch, magnet=self._magnet.dist_inputs(policy, batch))
-            if self._teacher is not None and self._teacher_weight:
-                batch = replace(batch, taught=self._teacher.actions(policy, batch, self.weights_version))
+            if not self._teacher_weight:
+                # The teacher may have acted before: samples are requested ahead.
+                batch = replace(batch, taught=None)
             batches[policy] = batch
         return batches
 
@@ -292,10 +366,11 @@ class PPOLearner(FixedPoliciesLearner):
         self, *, module_id: str, batch: Minibatch, fwd_out: dict[str, Tensor], **_: Any
     ) -> PPOLoss:
         """Return the loss of one policy on some steps."""
+        critic = self._critics.get(module_id)
         return ppo_loss(
             batch,
             fwd_out[Columns.ACTION_DIST_INPUTS],
-            fwd_out[Columns.VF_PREDS],
+            fwd_out[Columns.VF_PREDS] if critic is None else critic(batch.inputs[Columns.OBS] | batch.central),
             self.module[module_id].distribution,
             clip=self.hyperparameters[module_id].clip,
             entropy=self.hyperparameters[module_id].entropy,
@@ -305,8 +380,8 @@ class PPOLearner(FixedPoliciesLearner):
         )
 
     def _lr(self, name: str) -> float:
-        """Return the current learning rate of a policy, or of a shared encoder."""
-        return self._common_lr if name == ALL_MODULES else self.hyperparameters[name].lr
+        """Return the current learning rate of an optimiser."""
+        return self._common_lr if name == ALL_MODULES else self.hyperparameters[name.removesuffix(CRITIC)].lr
 
     def get_state(
         self,
@@ -315,14 +390,21 @@ class PPOLearner(FixedPoliciesLearner):
         not_components: str | Collection[str] | None = None,
         **kwargs: Any,
     ) -> dict[str, Any]:
-        """Return RLlib's state with the snapshot of the magnet, if it has one."""
+        """Return RLlib's state with the central critics, the units of returns and the magnet's snapshot, if any."""
         state: dict[str, Any] = super().get_state(components, not_components=not_components, **kwargs)
+        for key, networks in ((CRITICS, self._critics), (SCALES, self._scales)):
+            if networks and includes_component(self, key, components, not_components):
+                state[key] = {policy: network.state_dict() for policy, network in networks.items()}
         if isinstance(self._magnet, Previous) and includes_component(self, MAGNET, components, not_components):
             state[MAGNET] = self._magnet.get_state()
         return state
 
     def set_state(self, state: dict[str, Any]) -> None:
         super().set_state(state)
+        for key, networks in ((CRITICS, self._critics), (SCALES, self._scales)):
+            # A run without them, which this one continues, has none.
+            for policy, weights in state.get(key, {}).items() if networks else ():
+                networks[policy].load_state_dict(weights)
         if isinstance(self._magnet, Previous):
             # A run without a magnet, which this one continues, has no snapshot.
             self._magnet.set_state(state.get(MAGNET) or states(self.module))
@@ -336,16 +418,15 @@ class PPOLearner(FixedPoliciesLearner):
         divergences = self._divergences(batches)
         for policy, batch in batches.items():
             means = torch.stack(statistics[policy]).mean(0).tolist()
-            logged = dict(zip((*STATISTICS, MAGNET_KL, TEACHER_LOSS), means, strict=True))
+            names: tuple[str, ...] = STATISTICS
+            names += () if batch.magnet is None else (MAGNET_KL,)
+            names += () if batch.taught is None else (TEACHER_LOSS,)
+            logged = dict(zip(names, means, strict=True))
             logged |= {EXPLAINED_VARIANCE: batch.explained_variance, KL: divergences[policy]}
             scheduled = scheduled_hyperparameters(self.settings, policy)
             logged |= {SCHEDULES[name]: getattr(self.hyperparameters[policy], name) for name in scheduled}
-            if self.settings.magnet is None:
-                del logged[MAGNET_KL]
-            elif not isinstance(self.settings.magnet.weight, float):
+            if self.settings.magnet is not None and not isinstance(self.settings.magnet.weight, float):
                 logged[MAGNET_WEIGHT] = self._magnet_weight
-            if not self._teacher_weight:
-                del logged[TEACHER_LOSS]
             if self.settings.teacher is not None and not isinstance(self.settings.teacher.weight, float):
                 logged[TEACHER_WEIGHT] = self._teacher_weight
             self.metrics.log_dict(logged, key=policy, window=1)
@@ -353,7 +434,7 @@ class PPOLearner(FixedPoliciesLearner):
 
     @torch.no_grad()
     def _divergences(self, batches: dict[str, TrainBatch]) -> dict[str, float]:
-        """Estimate each policy's divergence from before the update, on about KL_STEPS steps."""
+        """Estimate each policy's divergence from the one that sampled the batch, on about KL_STEPS steps."""
         samples = {}
         for policy, batch in batches.items():
             stride = -(-len(batch) // KL_STEPS)

@@ -146,7 +146,8 @@ class QMIXLearner(OffPolicyLearner):
 
     def extra_networks(self) -> dict[str, nn.Module]:
         self.teams = teams(self.settings.groups, self.interface)
-        self.columns = team_columns(self.teams, self.interface)
+        columns = team_columns(self.teams, self.interface)
+        self.columns = {team: torch.tensor(indices, device=self.device) for team, indices in columns.items()}
         if self.settings.mixer != "qmix":
             return {}
         environment = LeagueConfig.model_validate(self.config.env_config[LEAGUE]).environment
@@ -161,26 +162,31 @@ class QMIXLearner(OffPolicyLearner):
         rows, weights = batches[JOINT].rows, batches[JOINT].weights
         action_values, following = self._values(rows, learning)
         networks = [policy for policy in self.interface.policy_ids if policy in learning]
-        totals, errors, values = [], [], []
+        counted_rows = weights > 0
+        totals, errors, values, numbers = [], [], [], []
         for team, steps in self._steps(rows, learning).items():
             networks += [name for name in (_mixer_name(team),) if name in self.networks]
             columns = self.columns[team]
             if isinstance(mixer := self.networks.get(_mixer_name(team)), MonotonicMixer):
-                mixer.update_statistics(steps.states[weights > 0])
-            mixed = steps.mixed(self.mixer(self.networks, team), action_values[:, columns])
+                mixer.update_statistics(steps.states, counted_rows)
+            mixed = steps.mixed(self.mixer(self.networks, team), action_values.index_select(1, columns))
             with torch.no_grad():
-                targets = steps.targets(self.mixer(self.targets, team), following[:, columns])
-                counted = steps.counted() & (weights > 0).unsqueeze(-1)
+                targets = steps.targets(self.mixer(self.targets, team), following.index_select(1, columns))
+                counted = steps.counted() & counted_rows.unsqueeze(-1)
             differences = torch.where(counted, mixed - targets, 0.0)
-            totals.append((weights.unsqueeze(-1) * differences.square()).sum() / counted.sum().clamp(min=1))
-            errors.append(differences.abs().amax(-1))
-            values.append(mixed[counted])
+            numbers.append(counted.sum())
+            totals.append((weights.unsqueeze(-1) * differences.square()).sum() / numbers[-1].clamp(min=1))
+            errors.append(differences.detach().abs().amax(-1))
+            values.append((mixed.detach() * counted).sum())
         largest = torch.stack(errors).amax(0)
         loss = ReplayLoss(
             total=torch.stack(totals).sum(),
             errors=largest,
             networks=tuple(networks),
-            statistics={"value": torch.cat(values).mean(), "error": largest[weights > 0].mean()},
+            statistics={
+                "value": torch.stack(values).sum() / torch.stack(numbers).sum().clamp(min=1),
+                "error": largest.sum() / counted_rows.sum(),
+            },
         )
         return {JOINT: loss}
 
@@ -194,9 +200,9 @@ class QMIXLearner(OffPolicyLearner):
         discounts, states, next_states = rows[DISCOUNTS], rows[STATE], rows[NEXT + STATE]
         return {
             team: TeamSteps(
-                rewards[:, columns],
-                present[:, columns],
-                terminated[:, columns],
+                rewards.index_select(1, columns),
+                present.index_select(1, columns),
+                terminated.index_select(1, columns),
                 discounts,
                 states,
                 next_states,
@@ -230,9 +236,7 @@ class QMIXLearner(OffPolicyLearner):
                 present=rows[f"{PRESENT}/{policy}"],
             )
             if policy in learning:
-                network.encoder.update_statistics(
-                    {name: rows[play.present] for name, rows in play.observations.items()}
-                )
+                network.encoder.update_statistics(flatten_leading(play.observations), play.present.flatten())
             values, online = self._current_and_next(network, play)
             action_values.append(values.gather(-1, play.actions.unsqueeze(-1)).squeeze(-1))
             with torch.no_grad():

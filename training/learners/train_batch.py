@@ -6,7 +6,8 @@ chunk is the bootstrap: 0 if the agent terminated, its value if the agent was tr
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,13 @@ from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from torch import Tensor
 
+from training.learners.ranks import ALONE, Rank
 from training.modules.actor_critic import ActorCritic
-from training.sampling.episode_chunks import EpisodeChunks
+from training.modules.value_function import CentralCritic, ReturnNormalization
+from training.sampling.episode_chunks import PASS_ROWS, EpisodeChunks, acted_rows
+
+GPU_PASS_ROWS = 4 * PASS_ROWS
+"""Rows per forward pass on a GPU, where a pass of fewer rows takes as long."""
 
 
 def generalized_advantages(
@@ -48,23 +54,26 @@ def generalized_advantages(
         (n,) float64.
     """
     assert rewards.shape == values.shape == next_values.shape == lasts.shape
-    deltas = rewards.astype(np.float64) + gamma * next_values - values
-    decays = np.where(lasts, 0.0, gamma * lambda_)
-    advantages = np.empty_like(deltas)
-    advantage = 0.0
-    # Plain floats are faster than one NumPy call per time step of a padded matrix.
-    steps = zip(range(len(deltas) - 1, -1, -1), deltas[::-1].tolist(), decays[::-1].tolist(), strict=True)
-    for t, delta, decay in steps:
-        advantage = delta + decay * advantage
-        advantages[t] = advantage
+    advantages = rewards.astype(np.float64) + gamma * next_values - values
+    decays, steps = np.where(lasts, 0.0, gamma * lambda_), 1
+    # Each advantage is the sum over `steps` steps, which doubles (Hillis and Steele, 1986, "Data parallel algorithms").
+    while decays[:-steps].any():
+        advantages[:-steps] += decays[:-steps] * advantages[steps:]
+        decays[:-steps] *= decays[steps:]
+        steps *= 2
     return advantages
 
 
 Bootstraps = Callable[[EpisodeChunks], NDArray]
 """c chunks → (c,) bool: whether the value of each chunk's last observation counts."""
 
-PASS_ROWS = 2048
-"""Rows per forward pass over a batch: more than a few thousand images as floats would exhaust memory."""
+
+def select(column: Tensor, rows: Tensor) -> Tensor:
+    """Return some rows of an observation's column.
+
+    `index_select` copies them up to ten times as fast as indexing, but not unsigned integers of more than a byte.
+    """
+    return column[rows] if column.dtype in (torch.uint16, torch.uint32, torch.uint64) else column.index_select(0, rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +111,8 @@ class TrainBatch:
     """Inputs of the action distribution of the magnet's reference policy, (n, d)."""
     taught: Tensor | None = None
     """Raw actions of the teacher, (n,) or (n, m)."""
+    central: dict[str, Tensor] = field(default_factory=dict)
+    """What a central critic gets besides the observations, with the same rows: column → (N, …)."""
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -111,32 +122,42 @@ class TrainBatch:
         """The number of units that minibatches are drawn from: sequences if recurrent, otherwise steps."""
         return len(self) if self.sequences is None else len(self.sequences.starts)
 
-    def take(self, units: Tensor) -> "Minibatch":
-        """Return the steps of some units, in order."""
-        if self.sequences is None:
-            steps, memory = units, {}
-        else:
+    def take(self, units: Tensor | slice) -> "Minibatch":
+        """Return the steps of some units, in order. A slice, only without sequences, copies observations only."""
+        steps, memory = units, {}
+        if self.sequences is not None:
             starts, lengths = self.sequences.starts[units], self.sequences.lengths[units]
             offsets = torch.arange(int(lengths.max()), device=starts.device)
             steps = (starts.unsqueeze(1) + offsets)[offsets < lengths.unsqueeze(1)]
             state = {key: value[units] for key, value in self.sequences.state.items()}
             memory = {Columns.SEQ_LENS: lengths, Columns.STATE_IN: state}
-        rows = self.acted[steps]
-        return Minibatch(
-            inputs={Columns.OBS: {name: value[rows] for name, value in self.observations.items()}, **memory},
-            actions=self.actions[steps],
-            dist_inputs=self.dist_inputs[steps],
-            log_p=self.log_p[steps],
-            advantages=self.advantages[steps],
-            targets=self.targets[steps],
-            magnet=None if self.magnet is None else self.magnet[steps],
-            taught=None if self.taught is None else self.taught[steps],
+        columns = self._columns(steps)
+        rows = columns.pop("acted")
+        observations, central = (
+            {name: select(value, rows) for name, value in part.items()} for part in (self.observations, self.central)
         )
+        return Minibatch(inputs={Columns.OBS: observations, **memory}, central=central, **columns)
+
+    def in_order(self, order: Tensor) -> "TrainBatch":
+        """Return the steps in another order, without sequences."""
+        return replace(self, **self._columns(order), sequences=None)
+
+    def _columns(self, steps: Tensor | slice) -> dict[str, Any]:
+        """Return the columns that have a row for each step, at some steps."""
+        names = ("acted", "actions", "dist_inputs", "log_p", "advantages", "targets", "magnet", "taught")
+        columns = {name: column for name in names if (column := getattr(self, name)) is not None}
+        if isinstance(steps, slice):
+            return {name: column[steps] for name, column in columns.items()}
+        return {name: column.index_select(0, steps) for name, column in columns.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Minibatch:
-    """Some steps of a TrainBatch. inputs: the arguments of the module's `forward_train`."""
+    """Some steps of a TrainBatch.
+
+    inputs: the arguments of the module's `forward_train`. central: what a central critic gets besides the observations.
+    fraction: of the steps that all learners have together.
+    """
 
     inputs: dict[str, Any]
     actions: Tensor
@@ -146,6 +167,8 @@ class Minibatch:
     targets: Tensor
     magnet: Tensor | None = None
     taught: Tensor | None = None
+    fraction: float = 1.0
+    central: dict[str, Tensor] = field(default_factory=dict)
 
 
 def bootstrap_unless_terminated(chunks: EpisodeChunks) -> NDArray:
@@ -161,8 +184,10 @@ def train_batch(
     lambda_: float,
     sequence: int | None = None,
     bootstraps: Bootstraps = bootstrap_unless_terminated,
+    critic: CentralCritic | None = None,
+    scale: ReturnNormalization | None = None,
 ) -> TrainBatch:
-    """Build a batch on the module's device, after updating its observation statistics.
+    """Build a batch on the module's device, after updating the observation statistics.
 
     Args:
         module: The policy's module.
@@ -171,10 +196,12 @@ def train_batch(
         lambda_: λ of the advantages.
         sequence: Maximum length of the sequences for a recurrent module.
         bootstraps: Selects the chunks whose last observation is bootstrapped from.
+        critic: The value function; by default the module's own.
+        scale: The units of the value function and the targets, which the targets update; by default those of returns.
     """
     device = next(module.parameters()).device
     lengths = np.concatenate([chunks.lengths for chunks in samples])
-    acted = np.delete(np.arange(lengths.sum() + len(lengths)), np.cumsum(lengths + 1) - 1)
+    acted = acted_rows(lengths)
 
     def column(values: NDArray) -> Tensor:
         return torch.from_numpy(values).to(device)
@@ -183,9 +210,18 @@ def train_batch(
         name: column(np.concatenate([chunks.observations[name] for chunks in samples]))
         for name in samples[0].observations
     }
-    module.encoder.update_statistics(observations)
+    module.update_statistics(observations)
     state = {key: column(np.concatenate([chunks.state[key] for chunks in samples])) for key in samples[0].state}
-    values, bootstrap = _values(module, observations, acted, lengths, state)
+    central = {
+        name: column(np.concatenate([chunks.central[name] for chunks in samples])) for name in samples[0].central
+    }
+    if critic is None:
+        values, bootstrap = _values(module, observations, acted, lengths, state)
+    else:
+        critic.encoder.update_statistics(observations | central)
+        values, bootstrap = _values(critic, observations | central, acted, lengths, {})
+    if scale is not None:
+        values, bootstrap = scale.denormalized(values), scale.denormalized(bootstrap)
     next_values = np.append(values[1:], 0.0)
     next_values[np.cumsum(lengths) - 1] = bootstrap * np.concatenate([bootstraps(chunks) for chunks in samples])
     rewards = np.concatenate([chunks.rewards for chunks in samples])
@@ -193,6 +229,12 @@ def train_batch(
     lasts[np.cumsum(lengths) - 1] = True
     advantages = generalized_advantages(rewards, values, next_values, lasts, gamma, lambda_)
     targets = advantages + values
+    explained_variance = float(1 - advantages.var() / max(targets.var(), 1e-8))
+    if scale is not None:
+        scale.update(torch.from_numpy(targets))
+        targets = scale.normalized(targets)
+    taught = [chunks.taught for chunks in samples if chunks.taught is not None]
+    assert len(taught) in (0, len(samples)), "the teacher acts on all steps of a batch or on none"
     sequences = None
     if sequence is not None and state:
         # Each chunk is split into sequences of this number of steps and a remainder.
@@ -210,12 +252,14 @@ def train_batch(
         advantages=column(((advantages - advantages.mean()) / max(1e-4, advantages.std())).astype(np.float32)),
         targets=column(targets.astype(np.float32)),
         sequences=sequences,
-        explained_variance=float(1 - advantages.var() / max(targets.var(), 1e-8)),
+        explained_variance=explained_variance,
+        taught=column(np.concatenate(taught)) if taught else None,
+        central=central,
     )
 
 
 def _values(
-    module: ActorCritic,
+    module: ActorCritic | CentralCritic,
     observations: dict[str, Tensor],
     acted: NDArray,
     lengths: NDArray,
@@ -233,24 +277,30 @@ def _values(
 
 @torch.no_grad()
 def _value_pass(
-    module: ActorCritic, observations: dict[str, Tensor], rows: NDArray, state: dict[str, Tensor]
+    module: ActorCritic | CentralCritic, observations: dict[str, Tensor], rows: NDArray, state: dict[str, Tensor]
 ) -> tuple[NDArray, dict[str, Tensor]]:
     """Return the values of some rows, one step each from its own recurrent state, and the states after it."""
     values, states = [], []
-    for first in range(0, len(rows), PASS_ROWS):
-        part = slice(first, first + PASS_ROWS)
+    indices = torch.from_numpy(rows).to(next(iter(observations.values())).device)
+    size = GPU_PASS_ROWS if indices.is_cuda else PASS_ROWS
+    for first in range(0, len(rows), size):
+        part = slice(first, first + size)
         batch = {
-            Columns.OBS: {name: value[rows[part]] for name, value in observations.items()},
+            Columns.OBS: {name: select(value, indices[part]) for name, value in observations.items()},
             Columns.STATE_IN: {key: value[part] for key, value in state.items()},
         }
         value, after = module.value_step(batch)
-        values.append(value.cpu().numpy())
+        values.append(value)
         states.append(after)
-    return np.concatenate(values), {key: torch.cat([after[key] for after in states]) for key in state}
+    return torch.cat(values).cpu().numpy(), {key: torch.cat([after[key] for after in states]) for key in state}
 
 
-def minibatches(batches: Mapping[str, TrainBatch], *, size: int, epochs: int) -> Iterator[dict[str, Minibatch]]:
+def minibatches(
+    batches: Mapping[str, TrainBatch], *, size: int, epochs: int, rank: Rank = ALONE
+) -> Iterator[dict[str, Minibatch]]:
     """Yield policy id → minibatch; each epoch visits each step of each policy once, in a new random order.
+
+    Of several learners, each has its share of every minibatch.
 
     All policies have the same number of minibatches, given by the policy with the most steps and `size`. RLlib's
     MiniBatchCyclicIterator uses equal sizes instead, which repeats the few steps of a small policy many times per
@@ -258,11 +308,25 @@ def minibatches(batches: Mapping[str, TrainBatch], *, size: int, epochs: int) ->
     """
     count = -(-max(len(batch) for batch in batches.values()) // size)
     for _ in range(epochs):
-        orders = {policy: _order(batch).tensor_split(count) for policy, batch in batches.items()}
-        for i in range(count):
-            yield {policy: batches[policy].take(order[i]) for policy, order in orders.items() if len(order[i])}
+        drawn = {policy: _epoch(batch, count, rank) for policy, batch in batches.items()}
+        for parts in zip_longest(*drawn.values()):
+            yield {policy: part for policy, part in zip(drawn, parts, strict=True) if part is not None}
 
 
-def _order(batch: TrainBatch) -> torch.Tensor:
+def _epoch(batch: TrainBatch, count: int, rank: Rank) -> Iterator[Minibatch]:
+    """Yield at most `count` minibatches, none of them empty."""
     # Drawn on the CPU, for the same order on every device.
-    return torch.randperm(batch.units).to(batch.acted.device)
+    order = torch.randperm(batch.units).to(batch.acted.device)
+    parts = [part for part in order.tensor_split(count) if len(part)]
+    if rank.count > 1:
+        for part in parts:
+            share, fraction = rank.share(part, None if batch.sequences is None else batch.sequences.lengths)
+            yield replace(batch.take(share), fraction=fraction)
+    elif batch.sequences is not None:
+        yield from map(batch.take, parts)
+    else:
+        # One copy of each column costs less than one for each minibatch.
+        batch, stop = batch.in_order(order), 0
+        for part in parts:
+            start, stop = stop, stop + len(part)
+            yield batch.take(slice(start, stop))

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from league.spaces import ACTION_MASK
 from training.modules.distributions import TorchGaussian, torch_distribution
 from training.modules.encoder import Encoder, linear
+from training.modules.own_network import OwnNetwork
 from training.modules.policy_module import PolicyModule, mask_illegal
 from training.modules.recurrent import LSTMLayer, State
 
@@ -55,6 +56,10 @@ class ActorCritic(PolicyModule, ValueFunctionAPI):
         """Return the state before an episode's first step, key → (width,); empty if not recurrent."""
         return {} if self.recurrent is None else self.recurrent.initial_state()
 
+    def update_statistics(self, observations: dict[str, Tensor]) -> None:
+        """Update the running statistics of observations, if they are normalised."""
+        self.encoder.update_statistics(observations)
+
     def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
         embeddings, state = self._step(batch)
         acted: dict[str, Any] = self.policy_outputs(embeddings, batch[Columns.OBS])
@@ -68,17 +73,24 @@ class ActorCritic(PolicyModule, ValueFunctionAPI):
 
     def policy_outputs(self, embeddings: Tensor, observations: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the distribution inputs, (B, d), for encoded rows."""
-        answers = self.policy_head(embeddings)
-        if self.log_deviations is None:
-            return {Columns.ACTION_DIST_INPUTS: mask_illegal(answers, observations)}
-        deviations = self.log_deviations.clamp(*LOG_DEVIATION_BOUNDS).expand_as(answers)
-        return {Columns.ACTION_DIST_INPUTS: torch.cat([answers, deviations], dim=-1)}
+        return {Columns.ACTION_DIST_INPUTS: self._dist_inputs(self.policy_head(embeddings), observations)}
 
     def train_outputs(self, embeddings: Tensor, observations: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the distribution inputs, (B, d), and values, (B,), for encoded rows."""
-        return self.policy_outputs(embeddings, observations) | {
-            Columns.VF_PREDS: self.value_head(embeddings).squeeze(-1)
+        # Both heads in one product, whose time hardly depends on the number of outputs.
+        weight = torch.cat([self.policy_head.weight, self.value_head.weight])
+        bias = torch.cat([self.policy_head.bias, self.value_head.bias])
+        answers, values = nn.functional.linear(embeddings, weight, bias).split([self.distribution.outputs, 1], dim=-1)
+        return {
+            Columns.ACTION_DIST_INPUTS: self._dist_inputs(answers, observations),
+            Columns.VF_PREDS: values.squeeze(-1),
         }
+
+    def _dist_inputs(self, answers: Tensor, observations: dict[str, Tensor]) -> Tensor:
+        if self.log_deviations is None:
+            return mask_illegal(answers, observations)
+        deviations = self.log_deviations.clamp(*LOG_DEVIATION_BOUNDS).expand_as(answers)
+        return torch.cat([answers, deviations], dim=-1)
 
     def compute_values(self, batch: dict[str, Any], embeddings: Tensor | None = None) -> Tensor:
         """Return the values, (B,), of the observations in `batch`, one step each."""
@@ -108,7 +120,7 @@ class SharedEncoder(MultiRLModule):
             module.encoder = modules[0].encoder
 
     @property
-    def encoder(self) -> Encoder:
+    def encoder(self) -> Encoder | OwnNetwork:
         """The shared encoder."""
         return next(iter(self.values())).encoder
 

@@ -45,16 +45,25 @@ class RunningNormalization(nn.Module):
         return scaled.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS).float()
 
     @torch.no_grad()
-    def update(self, values: Tensor) -> None:
-        """Add a batch (B, *shape).
+    def update(self, values: Tensor, counted: Tensor | None = None) -> None:
+        """Add a batch (B, *shape), or the rows of it that are `counted`, (B,) bool.
 
         Chan, Golub and LeVeque, 1979, "Updating formulae and a pairwise algorithm for computing sample variances":
         with δ the difference of the two means, M = M_a + M_b + δ² n_a n_b / n.
         """
-        values, batch_size = values.double(), len(values)
-        total = self.count + batch_size
-        delta = values.mean(0) - self.mean
-        squares = self.variance * self.count + values.var(0, correction=0) * batch_size
+        values = values.double()
+        batch_size: int | Tensor
+        if counted is None:
+            batch_size, mean, variance = len(values), values.mean(0), values.var(0, correction=0)
+        else:
+            # Sums of all rows, since the size of a selection would have to be read from a GPU.
+            batch_size = counted.sum()
+            shares = (counted.double() / batch_size.clamp(min=1)).view(-1, *[1] * (values.ndim - 1))
+            mean = (shares * values).sum(0)
+            variance = (shares * (values - mean).square()).sum(0)
+        total = (self.count + batch_size).clamp(min=1)
+        delta = mean - self.mean
+        squares = self.variance * self.count + variance * batch_size
         squares += delta.square() * self.count * batch_size / total
         self.mean += delta * batch_size / total
         self.variance.copy_(squares / total)
@@ -98,12 +107,12 @@ class ObservationFeatures(nn.Module):
         rows = [part(observations[name]) for name, part in zip(self.names, self.parts, strict=True)]
         return rows[0] if len(rows) == 1 else torch.cat(rows, dim=-1)
 
-    def update_statistics(self, observations: dict[str, Tensor]) -> None:
-        """Update the running statistics of the parts that have them."""
+    def update_statistics(self, observations: dict[str, Tensor], counted: Tensor | None = None) -> None:
+        """Update the running statistics of the parts that have them. counted: see `RunningNormalization.update`."""
         for name, part in zip(self.names, self.parts, strict=True):
             for layer in part.modules():
                 if isinstance(layer, RunningNormalization):
-                    layer.update(observations[name])
+                    layer.update(observations[name], counted)
 
 
 class OneHot(nn.Module):
@@ -163,7 +172,7 @@ class ImageEncoder(nn.Module):
     """Images (B, height, width, channels) or (B, channels, height, width) → convolutions → (B, width).
 
     With gradients, convolutions of small images are matrix products on the CPU: libraries optimise convolutions for
-    many channels. Only kernels of one pixel may follow the first layer, since others would scatter gradients.
+    many channels. Only kernels of one pixel and stride 1 may follow the first layer: others would scatter gradients.
     """
 
     def __init__(
@@ -172,7 +181,9 @@ class ImageEncoder(nn.Module):
         super().__init__()
         self.numbers, self._is_first = numbers, channels_axis == "first"
         height, width, channels = (*shape[1:], shape[0]) if self._is_first else shape
-        self._is_small = height * width <= SMALL_IMAGE and all(kernel == 1 for _, kernel, _ in convolutions[1:])
+        self._is_small = height * width <= SMALL_IMAGE and all(
+            kernel == stride == 1 for _, kernel, stride in convolutions[1:]
+        )
         layers: list[nn.Module] = []
         for filters, kernel, stride in convolutions:
             if min(height, width) < kernel:
@@ -183,7 +194,7 @@ class ImageEncoder(nn.Module):
             if not self._is_first:
                 # This layout avoids moving the observations in memory.
                 layer.weight.data = layer.weight.data.to(memory_format=torch.channels_last)
-            layers += [layer, nn.ReLU()]
+            layers += [layer, nn.ReLU(inplace=True)]
             height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, filters
         self.convolutions = nn.Sequential(*layers, nn.Flatten())
 
@@ -195,17 +206,19 @@ class ImageEncoder(nn.Module):
 
     def _products(self, images: Tensor) -> Tensor:
         """Compute the convolutions of images (B, height, width, channels)."""
-        for layer in self.convolutions:
-            if isinstance(layer, nn.Conv2d):
-                (kernel, _), (stride, _) = layer.kernel_size, layer.stride
-                if kernel > 1:
-                    patches = images.unfold(1, kernel, stride).unfold(2, kernel, stride)
-                    images = patches.permute(0, 1, 2, 4, 5, 3).flatten(3)
-                else:  # without the slow gradient of `unfold`
-                    images = images[:, ::stride, ::stride]
-                weight = layer.weight.permute(0, 2, 3, 1).flatten(1)
-                images = nn.functional.linear(images, weight, layer.bias).relu()
-        return images.permute(0, 3, 1, 2).flatten(1)
+        first, *layers = (layer for layer in self.convolutions if isinstance(layer, nn.Conv2d))
+        (kernel, _), (stride, _) = first.kernel_size, first.stride
+        patches = images.unfold(1, kernel, stride).unfold(2, kernel, stride).permute(0, 1, 2, 4, 5, 3).flatten(3)
+        pixels = _product(patches.flatten(0, 2), first)
+        for layer in layers:
+            pixels = _product(pixels.relu_(), layer)
+        # ReLU last: its gradient is slow in another layout than its result.
+        return pixels.unflatten(0, patches.shape[:3]).permute(0, 3, 1, 2).flatten(1).relu_()
+
+
+def _product(patches: Tensor, layer: nn.Conv2d) -> Tensor:
+    """(n, kernel · kernel · channels) → (n, filters)."""
+    return nn.functional.linear(patches, layer.weight.permute(0, 2, 3, 1).flatten(1), layer.bias)
 
 
 def _feature(
@@ -251,16 +264,35 @@ class Encoder(nn.Module):
         layers: list[nn.Module] = []
         self.width = self.features.width
         for width in hidden:
-            layers += [linear(self.width, width, gain=2**0.5), nn.ReLU()]
+            layers += [linear(self.width, width, gain=2**0.5), nn.ReLU(inplace=True)]
             self.width = width
         self.hidden = nn.Sequential(*layers)
 
     def forward(self, observations: dict[str, Tensor]) -> Tensor:
+        if rounds_factors():
+            with torch.autocast("cpu", dtype=torch.bfloat16):
+                return self.hidden(self.features(observations)).float()
         return self.hidden(self.features(observations))
 
-    def update_statistics(self, observations: dict[str, Tensor]) -> None:
-        """Update the running statistics of the observations, if normalised."""
-        self.features.update_statistics(observations)
+    def update_statistics(self, observations: dict[str, Tensor], counted: Tensor | None = None) -> None:
+        """Update the running statistics of the observations, if normalised.
+
+        counted: see `RunningNormalization.update`.
+        """
+        self.features.update_statistics(observations, counted)
+
+
+def rounds_factors() -> bool:
+    """Return whether encoders round the factors of their products to bfloat16: in a gradient step on the CPU.
+
+    Without AMX, oneDNN does not round factors itself. Sums are float32, and rounded as the next factors.
+    """
+    return torch.backends.mkldnn.matmul.fp32_precision == "bf16" and has_bfloat16()  # type: ignore[attr-defined]
+
+
+def has_bfloat16() -> bool:
+    """Return whether the processor multiplies bfloat16, which it does about twice as fast as float32."""
+    return bool(torch.cpu.get_capabilities().get("avx512_bf16", False))
 
 
 def linear(inputs: int, outputs: int, gain: float) -> nn.Linear:

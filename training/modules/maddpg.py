@@ -70,22 +70,26 @@ class OneHotActions:
         return torch.cat([gumbel_softmax(part, temperature, gumbel(part)) for part in parts], dim=-1)
 
 
-class BoxActions:
+class BoxActions(nn.Module):
     """The elements of a Box of floats."""
 
+    low: Tensor
+    high: Tensor
+
     def __init__(self, space: gymnasium.spaces.Box) -> None:
+        super().__init__()
         low, high = (np.ravel(bound).astype(np.float32) for bound in (space.low, space.high))
         is_bounded = np.isfinite(low) & np.isfinite(high)
-        self._low = torch.as_tensor(np.where(is_bounded, -1, low))
-        self._high = torch.as_tensor(np.where(is_bounded, 1, high))
+        self.register_buffer("low", torch.as_tensor(np.where(is_bounded, -1, low)), persistent=False)
+        self.register_buffer("high", torch.as_tensor(np.where(is_bounded, 1, high)), persistent=False)
 
     @property
     def width(self) -> int:
-        return len(self._low)
+        return len(self.low)
 
     def encode(self, raw: Tensor) -> Tensor:
         """Clip to the bounds, since the environment does so, too."""
-        return raw.clamp(self._low.to(raw.device), self._high.to(raw.device))
+        return raw.clamp(self.low, self.high)
 
     def sample(self, dist_inputs: Tensor, temperature: float) -> Tensor:  # noqa: ARG002
         return dist_inputs[:, : self.width]

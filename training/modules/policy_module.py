@@ -9,6 +9,7 @@ from torch import Tensor
 from league.spaces import ACTION_MASK
 from training.modules.distributions import TorchDistribution
 from training.modules.encoder import Encoder
+from training.modules.own_network import OwnNetwork
 from training.rllib_compat import ExactStateModule
 
 MASKED_LOGIT = -1e9
@@ -27,15 +28,19 @@ class PolicyModule(ExactStateModule):
     """
 
     distribution: TorchDistribution
-    encoder: Encoder
+    encoder: Encoder | OwnNetwork
     exploration: float = 0.0
     """The amount of exploration in `_forward_exploration`, set by the runner before each sample: DQN's probability of a
     random action, or the noise deviation of a deterministic policy.
     """
 
-    def new_encoder(self) -> Encoder:
-        """Create the encoder that `model_config` describes: `hidden`, `convolutions`, `channels` and `normalize`."""
+    def new_encoder(self) -> Encoder | OwnNetwork:
+        """Create the encoder that `model_config` describes: `hidden`, `convolutions`, `channels` and `normalize`, or
+        `network` and `normalize`."""
         config = self.model_config
+        if config.get("network"):
+            entry_point, kwargs = config["network"]
+            return OwnNetwork(entry_point, kwargs, self.observation_space, config.get("normalize", False))
         return Encoder(
             self.observation_space,
             config["hidden"],

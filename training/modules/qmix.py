@@ -138,10 +138,10 @@ class MonotonicMixer(nn.Module):
         mixed = (nn.functional.elu(hidden) * self.second_weights(states).abs()).sum(-1, keepdim=True)
         return mixed + self.second_bias(states)
 
-    def update_statistics(self, states: Tensor) -> None:
-        """Update the running statistics of the state, if normalised."""
+    def update_statistics(self, states: Tensor, counted: Tensor | None = None) -> None:
+        """Update the running statistics of the state, if normalised. counted: see `RunningNormalization.update`."""
         if self.normalization is not None:
-            self.normalization.update(states)
+            self.normalization.update(states, counted)
 
 
 def vdn_mixer(values: Tensor, states: Tensor) -> Tensor:  # noqa: ARG001

@@ -7,6 +7,7 @@ from pathlib import Path
 from ray.exceptions import RayActorError, RayTaskError
 
 from league.errors import OWN_PACKAGES, LeagueError, one_line
+from training.learners.ranks import LearnerLost
 from training.rllib_compat import remote_traceback
 
 FRAME_LINE = re.compile(r'^\s*File "(?P<file>.+)", line (?P<line>\d+), in ', re.MULTILINE)
@@ -41,7 +42,7 @@ def training_error(error: BaseException, league: str, trace: Path) -> LeagueErro
 
 def is_process_lost(error: BaseException) -> bool:
     """Return whether the cause of an error is that a process of Ray ended or cannot be reached."""
-    return any(isinstance(cause, RayActorError) for cause in _causes(error))
+    return any(isinstance(cause, RayActorError | LearnerLost) for cause in _causes(error))
 
 
 def _causes(error: BaseException) -> list[BaseException]:

@@ -11,9 +11,9 @@ from typing import Any
 from ray import tune
 from ray.exceptions import RpcError
 
-from league.config.training import TrainingSettings
 from league.errors import ConfigError
 from league.ray_cluster import draining_nodes, node_resources
+from training.algorithms.resources import Resources
 from training.rllib_compat import NotPickled
 from training.runs.tune import cpu_share, requested_gpus
 
@@ -24,15 +24,15 @@ NODE_POLL = 1.0
 class NodeWatch(NotPickled, tune.Callback):
     """Watches during one attempt.
 
-    share: CPUs of the learner and of each runner. say: prints a line. request_move: asks the trial to save and end;
+    share: CPUs of each learner and runner. say: prints a line. request_move: asks the trial to save and end;
     `reason` then says why.
     """
 
     def __init__(
-        self, settings: TrainingSettings, share: float, say: Callable[[str], None], request_move: Callable[[], None]
+        self, used: Resources, share: float, say: Callable[[str], None], request_move: Callable[[], None]
     ) -> None:
         self.reason: str | None = None
-        self._runners, self._share, self._gpus = settings.runners, share, requested_gpus(settings)
+        self._processes, self._share, self._gpus = used.processes, share, requested_gpus(used)
         self._say, self._request_move = say, request_move
         self._nodes: frozenset[str] = frozenset()
         self._shown = ""
@@ -52,7 +52,7 @@ class NodeWatch(NotPickled, tune.Callback):
         except RpcError:  # the head is restarting
             return
         cpus, gpus = (sum(node.get(name, 0.0) for node in nodes) for name in ("CPU", "GPU"))
-        used = f"{self._share * (1 + self._runners):g} of {cpus:g} CPUs"
+        used = f"{self._share * self._processes:g} of {cpus:g} CPUs"
         if self._gpus:
             used += f", {self._gpus:g} of {gpus:g} GPUs"
         status = f"Training on {len(self._nodes)} of {len(nodes)} nodes, {used}."
@@ -67,6 +67,6 @@ class NodeWatch(NotPickled, tune.Callback):
         if leaving := self._nodes & draining_nodes():
             return f"{len(leaving)} of {len(self._nodes)} nodes are drained"
         try:
-            return "nodes have joined" if cpu_share(self._runners) > self._share else None
+            return "nodes have joined" if cpu_share(self._processes) > self._share else None
         except ConfigError:  # nodes have left: Ray reports what was lost with them
             return None

@@ -2,7 +2,9 @@
 plain lines elsewhere."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from statistics import fmean
 from typing import Any, Self
 
 from rich.console import Console
@@ -11,7 +13,11 @@ from rich.progress import Progress as Bars
 
 from league.config.training import TrainingSettings
 from league.registry.storage.rows import StrengthRow, VersionRow
-from training.algorithms.metrics import OTHER_TIME, PHASES
+from training.algorithms.curriculum import STAGE
+from training.algorithms.metrics import OTHER_TIME, PHASES, RUNNER_TIMES
+from training.algorithms.resources import Resources
+from training.runs.advice import advice, idle_share
+from training.runs.callbacks import OWN_METRICS
 from training.sampling.self_play import OPPONENTS
 
 SECONDS_PER_LINE = 10.0
@@ -19,10 +25,13 @@ MAX_POLICIES = 3
 """Policies shown individually; TensorBoard has all."""
 MAX_OPPONENTS = 3
 """Opponents shown, the most frequent ones."""
+MAX_OWN_METRICS = 3
+"""Metrics of callbacks shown."""
 ZERO_RETURN = 0.005
 """Smaller returns are displayed as 0.00."""
 OPPONENT_PREFIX = f"{OPPONENTS}/"
-SHOWN_PHASES = ("time/sampling", "time/learning")
+TIMES = (*PHASES, OTHER_TIME, *RUNNER_TIMES)
+SHOWN_PHASES = ("time/sampling", "time/waiting", "time/learning")
 
 
 class ProgressDisplay:
@@ -58,17 +67,29 @@ class TrainingProgress(ProgressDisplay):
         self._policies = policies
         self._bar = self._bars.add_task("Starting …", total=1.0, pace="", doing="")
         self._next_line = 0.0
+        self._seconds: Counter[str] = Counter()
+        self._gpu_uses: list[float] = []
 
     def update(self, metrics: Mapping[str, Any]) -> None:
         """Show a trial's latest metrics."""
         done = self._settings.budget_spent(metrics["steps"], metrics["seconds"])
+        self._seconds.update({name: metrics[name] for name in TIMES if name in metrics})
+        self._gpu_uses += [metrics["gpu/utilization"]] if "gpu/utilization" in metrics else []
         steps, pace = f"{metrics['steps']:,} steps", _pace(metrics, done)
-        doing = policy_summaries(metrics, self._policies) + opponent_summary(metrics)
+        doing = policy_summaries(metrics, self._policies) + opponent_summary(metrics) + own_summary(metrics)
+        if STAGE in metrics:
+            doing = f"stage {metrics[STAGE]:.0f} of {len(self._settings.curriculum)}; {doing}"
         if self._console.is_terminal:
             self._bars.update(self._bar, completed=done, description=steps, pace=pace, doing=doing)
         elif time.monotonic() >= self._next_line or metrics.get("done"):
             self._next_line = time.monotonic() + SECONDS_PER_LINE
             self.say(f"{done:4.0%}  {steps}  {pace}  {doing}")
+
+    def advise(self, used: Resources, cores: int) -> None:
+        """Print what to change, if a resource of the run was idle. cores: of all nodes."""
+        gpu_use = fmean(self._gpu_uses) / 100 if self._gpu_uses else None
+        if (sentence := advice(self._seconds, used, self._settings, cores, gpu_use)) is not None:
+            self.say(sentence)
 
     def published(self, version: VersionRow) -> None:
         """Print that a version was published."""
@@ -119,18 +140,35 @@ def opponent_summary(metrics: Mapping[str, Any]) -> str:
     return f"; score {', '.join(score_texts)}" if score_texts else ""
 
 
+def own_summary(metrics: Mapping[str, Any]) -> str:
+    """Return the metrics of callbacks; empty if there are none."""
+    values = {name: metrics[name] for name in metrics if name.startswith(OWN_METRICS)}
+    texts = [f"{name.removeprefix(OWN_METRICS)} {values[name]:.4g}" for name in list(values)[:MAX_OWN_METRICS]]
+    return f"; {', '.join(texts)}" if texts else ""
+
+
 def _pace(metrics: Mapping[str, Any], done: float) -> str:
-    """Return the speed, the shares of sampling and learning in the wall time since the last report, and the times."""
-    seconds = {name: metrics[name] for name in (*PHASES, OTHER_TIME) if name in metrics}
-    total = sum(seconds.values())
-    shares = ", ".join(
-        f"{seconds[name] / total:.0%} {name.removeprefix('time/')}" for name in SHOWN_PHASES if name in seconds
-    )
+    """Return the speed, how the wall time since the last report was used, and the times."""
     speed = f"{metrics['steps_per_second']:,.0f} steps/s" if "steps_per_second" in metrics else ""
     if speed:
-        speed += f" ({shares})  " if shares else "  "
+        use = ", ".join(_shares(metrics))
+        speed += f" ({use})  " if use else "  "
     remaining_seconds = metrics["seconds"] * (1 - done) / done if done else 0.0
     return f"{speed}{clock(metrics['seconds'])} elapsed, {clock(remaining_seconds)} left"
+
+
+def _shares(metrics: Mapping[str, Any]) -> Iterator[str]:
+    """The shares of the phases in the time of the learner's process, how long runners were idle, and the GPU."""
+    seconds = {name: metrics[name] for name in (*PHASES, OTHER_TIME) if name in metrics}
+    total = sum(seconds.values())
+    for name in SHOWN_PHASES:
+        if name in seconds:
+            yield f"{seconds[name] / total:.0%} {name.removeprefix('time/')}"
+    if (idle := idle_share(metrics)) is not None:
+        yield f"runners {idle:.0%} idle"
+    if "gpu/memory_gb" in metrics:
+        gpu_use = f"{metrics['gpu/utilization']:.0f}%, " if "gpu/utilization" in metrics else ""
+        yield f"GPU {gpu_use}{metrics['gpu/memory_gb']:.1f} GB"
 
 
 def clock(seconds: float) -> str:

@@ -18,6 +18,7 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
@@ -42,6 +43,7 @@ from league.registry.storage.manifest import MAIN, Role, trained_role
 from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunRow
 from league.registry.training.runs import RUNNING
 from league.settings import Storage
+from training.algorithms.resources import AUTO, Resources
 
 
 def write(record: BaseModel, path: Path) -> None:
@@ -70,7 +72,8 @@ def pin_opponents(
     """Resolve each opponent of `training.opponents`, the version of the magnet and the teacher: reference as written
     → `script:name`, `league@number`, or the URL of a version of a remote model.
 
-    trials: the league with the settings of a sweep's trials, whose references are resolved, too.
+    trials: the league with the settings of a sweep's trials, whose references are resolved, too. In training, a search
+    version plays without its search.
 
     Raises what loading a contestant raises: it does not exist, or does not fit the league.
     """
@@ -87,7 +90,10 @@ def pin_opponents(
         ref = parse_ref(of_league(written, config.league))
         if isinstance(ref, RemoteRef):
             ref = fixed_version(ref, interface)
-        pinned = registry.versions.resolve(ref).ref if isinstance(ref, CheckpointRef) else str(ref)
+        pinned = str(ref)
+        if isinstance(ref, CheckpointRef):
+            version = registry.versions.resolve(ref)
+            pinned = version.ref if version.search is None else f"{version.league}@{version.search.version}"
         for player in players(pinned, registry) if is_opponent else [pinned]:
             contestant(player, registry, interface)
         pins[written] = pinned
@@ -123,9 +129,12 @@ START = "start"
 STOP_FILE = "stop"
 OWN_ID = re.compile(r"\d{8}-\d{6}-[0-9a-f]{6}")
 """The id of a run that was started without a name: its start time and a random part."""
-RESOURCES = {"runners", "gpus", "runner_gpus", "crashes", "strength"}
+RESOURCES = {"runners", "learners", "threads", "gpus", "runner_gpus", "crashes", "strength"}
 """Training settings that depend on the machine."""
-RESUMABLE_SETTINGS = {"steps", "minutes", "checkpoint_every", "checkpoint_minutes", "exploiter", *RESOURCES}
+RESUMABLE_SETTINGS = {
+    *("steps", "minutes", "checkpoint_every", "checkpoint_minutes", "exploiter", "callbacks", "trackers"),
+    *RESOURCES,
+}
 """Training settings that may change when a run is resumed: duration and resources, not what is learned. The settings of
 `exploiter` are those of other runs; in an exploiter's own run they have replaced those of the league."""
 
@@ -143,6 +152,8 @@ class RunRecord(FrozenModel):
     exploits: str | None = None
     """The version that an exploiter is trained against."""
     git_commit: str | None
+    code: dict[str, str] = Field(default={})
+    """Entry point → SHA-256 of its source files when the run began, of the user's code in `training`."""
     started_at: datetime
     complete: bool = False
 
@@ -192,6 +203,7 @@ class RunDirectory:
             parent_steps=parent_steps,
             exploits=exploits,
             git_commit=git_commit,
+            code=config.training_code(),
             started_at=started_at,
         )
         return cls._at(path, record, may_exist=name is not None)
@@ -200,7 +212,8 @@ class RunDirectory:
     def find(cls, registry: Registry, config: LeagueConfig, name: str) -> Self | None:
         """Return the run with this id, if it has begun, on this machine or another one.
 
-        It keeps its settings, except that an incomplete one has the resources of `config`.
+        It keeps its settings, except that an incomplete one has the resources of `config`, chosen anew where they are
+        `auto`: the machine may be a smaller one.
 
         Raises AlreadyRunning if it is trained on another machine.
         """
@@ -235,7 +248,10 @@ class RunDirectory:
         record = _records(registry, config.league)[newest]
         if record.exploits is not None:
             config = config.against(record.exploits)
-        config = with_pins(config, record.pins)
+        # Where the file says auto, the run keeps what it has used so far.
+        written, used = config.training.model_dump(), record.config.training.model_dump()
+        automatic = [field.name for field in fields(Resources) if written[field.name] == AUTO]
+        config = with_pins(config, record.pins).with_training(**{name: used[name] for name in automatic})
         if (changed := changed_setting(record.config, config)) is not None:
             raise ConfigError(
                 f"{changed} has changed since training run {newest.name} began, so it cannot be resumed: "
@@ -284,6 +300,12 @@ class RunDirectory:
         """Delete the checkpoints of earlier attempts, complete or not, after all complete ones are published."""
         for attempt in self.attempts():
             shutil.rmtree(attempt / CHECKPOINTS, ignore_errors=True)
+
+    def use(self, used: Resources) -> None:
+        """Record what the run uses in place of `auto`."""
+        config = self.record.config.with_training(**used.settings)
+        self.record = self.record.model_copy(update={"config": config})
+        self._write()
 
     def complete(self) -> None:
         """Record that the budget is spent and everything is published."""

@@ -87,7 +87,7 @@ class RunReporter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         if self._thread.is_alive():
-            self._end = _ending(error)
+            self._end = ending(error)
             self._has_news.set()
             self._thread.join(FINAL_REPORT_SECONDS)
             self._is_over = True
@@ -155,7 +155,8 @@ class RunReporter:
         )
 
 
-def _ending(error: BaseException | None) -> tuple[RunState, str | None]:
+def ending(error: BaseException | None) -> tuple[RunState, str | None]:
+    """Return how a run ended, by the exception that ended it, and why it failed."""
     match error:
         case None:
             return "ended", None

@@ -40,8 +40,11 @@ class StrengthQueue:
         self, run: RunDirectory, registry: Registry, progress: TrainingProgress, measure: Measure | None
     ) -> None:
         """measure: None measures nothing, as does `training.strength: null`."""
-        settings = run.record.config.training.strength
-        self._games = 0 if settings is None or measure is None else settings.games
+        config = run.record.config
+        settings = config.training.strength
+        # Matches would take simulators from training.
+        is_measured = measure is not None and config.environment.external is None
+        self._games = settings.games if settings is not None and is_measured else 0
         self._run, self._registry, self._progress, self._measure = run, registry, progress, measure
         self._queue: queue.Queue[VersionRow] = queue.Queue()
         self._is_closed = False

@@ -10,6 +10,7 @@ import json
 import math
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,9 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 
 from league.config.league import LeagueConfig
 from league.config.schedules import ScheduleProgress
+from league.errors import StorageError
 from league.interface import Interface
-from league.ray_cluster import usable_cpus
+from league.registry.registry import Registry
 from league.settings import Storage
 from training.algorithms.metrics import (
     CHECKPOINT_TIME,
@@ -34,17 +36,22 @@ from training.algorithms.metrics import (
     totals,
     training_metrics,
 )
-from training.algorithms.rllib_config import algorithm_config
+from training.algorithms.ppo import PPO
+from training.algorithms.resources import resources
+from training.algorithms.rllib_config import algorithm_config, with_algorithm
 from training.rllib_compat import wait_for_runners
 from training.runs.checkpoint_digests import write_digests
 from training.runs.driver_files import DriverFiles, DriverMachine
+from training.sampling.play_metrics import PlayedEpisodes
 
 REPORT_SECONDS = 2.0
 """Interval between a trial's reports, in seconds."""
-MAX_THREADS = 4
-"""More do not accelerate networks of a few hundred units."""
+SIMULATOR_CHECK = 0.25
+"""Seconds between two looks whether a simulator has connected."""
 NEAR_DUPLICATE = 0.25
 """Part of an interval between checkpoints, below which the end of the time publishes no further version."""
+UPDATES, EPISODES = "updates", "finished_episodes"
+"""In a result, for callbacks: the metrics of each update since the last result, and the PlayedEpisodes."""
 PROGRESS_FILE = "progress.json"
 """In a checkpoint, beside RLlib's state: steps and seconds of training so far."""
 
@@ -72,7 +79,7 @@ class TrialPlan:
     """What a trial needs besides its league.
 
     start: the initial state. checkpoints: the directory for checkpoints. stop_file: a file whose existence requests
-    that the trial saves and ends. cpus: of the learner and of each runner. threads: of the learner, at most.
+    that the trial saves and ends. cpus: of each learner and runner. threads: of each learner, at most.
     run: the id of the run, which versions are named after. parent: the version that the run started from.
     driver: the machine of these files; None if there is only one.
     """
@@ -82,7 +89,6 @@ class TrialPlan:
     stop_file: Path
     storage: Storage
     cpus: float = 1.0
-    threads: int = MAX_THREADS
     run: str | None = None
     parent: int | None = None
     driver: DriverMachine | None = None
@@ -92,25 +98,32 @@ class Trial(tune.Trainable):
     """Trains until the budget is spent or a stop is requested. config: dumped `league` and `interface`, and a `plan`.
 
     A result contains the path of the checkpoint, if one was saved, whether the budget is `spent`, and Ray's ids of the
-    `nodes` of the learner and the runners.
+    `nodes` of the learners and the runners.
     """
 
     def setup(self, config: dict[str, Any]) -> None:
-        self.league = LeagueConfig.model_validate(config["league"])
+        self.league = with_algorithm(LeagueConfig.model_validate(config["league"]))
         self.interface = Interface.model_validate(config["interface"])
         self.plan: TrialPlan = config["plan"]
-        # Runners are idle while the learner works: it may use all cores.
-        torch.set_num_threads(min(usable_cpus(), self.plan.threads))
         self.files = DriverFiles() if self.plan.driver is None else self.plan.driver.files()
+        self.has_callbacks = bool(self.league.training.callbacks) and self.plan.run is not None
+        is_external = self.league.environment.external is not None
+        self.registry = Registry.open(self.plan.storage, create=False) if is_external else None
         start = self.plan.start
         checkpoint = None if start.checkpoint is None else self.files.fetch(start.checkpoint)
         self.algorithm = build_algorithm(self.league, self.interface, checkpoint, self.plan.cpus, self.plan.storage)
         if start.steps == start.steps_before_run:
             self.algorithm.opponents.refresh(parent=self.plan.parent)
+            self.algorithm.curriculum.restart(start.steps)
         else:
             self.algorithm.opponents.drop_removed()
         self.algorithm.reset_episodes(start.steps)
-        self.nodes = nodes_of(self.algorithm)
+        runner_nodes = self.algorithm.env_runner_group.foreach_env_runner(_node_id, local_env_runner=False)
+        further_learners = self.algorithm.further_learners.apply if isinstance(self.algorithm, PPO) else lambda *_: []
+        self.nodes = sorted({_node_id(self), *further_learners(_node_id), *runner_nodes})
+        threads = resources(self.league, len(self.interface.agents)).threads
+        torch.set_num_threads(threads)
+        further_learners(lambda _: torch.set_num_threads(threads))
         self.steps = self.saved_steps = start.steps
         self.seconds = self.saved_seconds = start.seconds
         self._plan_checkpoint()
@@ -119,14 +132,26 @@ class Trial(tune.Trainable):
         """Update until a report is due; return the latest value of each metric."""
         metrics: dict[str, Any] = {}
         sums: Counter[str] = Counter()
+        updates, episodes = list[dict[str, float]](), list[PlayedEpisodes]()
         began, steps = time.monotonic(), self.steps
         while time.monotonic() - began < REPORT_SECONDS and not self._due():
+            if self.registry is not None and not self._has_simulators(self.registry):
+                continue
             self.algorithm.progress = ScheduleProgress(self.steps, self._budget_spent())
             updated = time.monotonic()
             result = self.algorithm.train()
             self.seconds += time.monotonic() - updated
             self.steps += int(result[ENV_RUNNER_RESULTS][NUM_ENV_STEPS_SAMPLED])
-            metrics |= training_metrics(result, self.interface)
+            update = (
+                training_metrics(result, self.interface, self.algorithm.curves) | self.algorithm.curriculum.metrics()
+            )
+            if self.algorithm.curriculum.advance(update, self.steps):
+                self.algorithm.reset_episodes(self.steps)
+            metrics |= update
+            if self.has_callbacks:
+                updates.append(update | self._progress())
+                episodes += self.algorithm.episodes
+            self.algorithm.episodes = []
             sums.update(totals(result))
         elapsed = time.monotonic() - began
         if self.steps > steps:
@@ -137,18 +162,28 @@ class Trial(tune.Trainable):
             saving = time.monotonic()
             metrics["checkpoint"] = str(self._save())
             metrics[CHECKPOINT_TIME] = time.monotonic() - saving
-        return metrics | {
-            "timesteps_total": self.steps,
-            "steps": self.steps - self.plan.start.steps_before_run,
-            "seconds": self.seconds,
-            "spent": self._spent(),
-            "done": done,
-            "nodes": self.nodes,
-        }
+        if self.has_callbacks:
+            metrics |= {UPDATES: updates, EPISODES: episodes}
+        return (
+            metrics
+            | self._progress()
+            | {
+                "timesteps_total": self.steps,
+                "spent": self._spent(),
+                "done": done,
+                "nodes": self.nodes,
+            }
+        )
+
+    def _progress(self) -> dict[str, Any]:
+        """Return what the run has done so far: actions, and seconds of training."""
+        return {"steps": self.steps - self.plan.start.steps_before_run, "seconds": self.seconds}
 
     def cleanup(self) -> None:
         self.algorithm.stop()
         self.files.close()
+        if self.registry is not None:
+            self.registry.close()
 
     def _due(self) -> bool:
         reached = self.steps >= self.next_steps or self.seconds >= self.next_seconds
@@ -171,6 +206,15 @@ class Trial(tune.Trainable):
         if settings.checkpoint_minutes is not None:
             shares.append((self.seconds - self.saved_seconds) / (60 * settings.checkpoint_minutes))
         return max(shares, default=1.0) < NEAR_DUPLICATE
+
+    def _has_simulators(self, registry: Registry) -> bool:
+        """Whether simulators are connected. Waiting for them is no part of the run's minutes."""
+        with suppress(StorageError):
+            gateways = registry.gateways.open(self.league.league)
+            if any(gateway.simulators and not gateway.is_evaluation for gateway in gateways):
+                return True
+        time.sleep(SIMULATOR_CHECK)
+        return False
 
     def _stop_requested(self) -> bool:
         return self.files.exists(self.plan.stop_file)
@@ -224,13 +268,7 @@ def build_algorithm(
     return algorithm
 
 
-def nodes_of(algorithm: Algorithm) -> list[str]:
-    """Return Ray's ids of the nodes of the learner and the runners."""
-    runners = algorithm.env_runner_group.foreach_env_runner(_node_id, local_env_runner=False)
-    return sorted({_node_id(), *runners})
-
-
-def _node_id(*_: Any) -> str:
+def _node_id(_: Any) -> str:
     return str(ray.get_runtime_context().get_node_id())
 
 

@@ -3,16 +3,16 @@
 import math
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ray import tune
 
-from league.config.training import TrainingSettings
 from league.errors import ConfigError
 from league.ray_cluster import has_autoscaler, node_resources
+from training.algorithms.resources import Resources
 from training.rllib_compat import restored_sigusr1
 from training.runs.run_reporter import TensorBoard
 
@@ -20,63 +20,82 @@ MIN_CPU_SHARE = 0.05
 """Minimum CPU share of a process; at most twenty processes share a CPU."""
 
 
-def cpu_share(runners: int, at_once: int = 1) -> float:
-    """Return the CPUs of the learner and of each runner: one, or less if there are fewer.
+def cpu_share(processes: int, at_once: int = 1) -> float:
+    """Return the CPUs of each learner and runner: one, or less if there are fewer.
 
-    They take turns, so that a few more of them than CPUs do not overload a machine. at_once: number of concurrent
-    trials. Raises ConfigError if there are far too many. If Ray's autoscaler adds nodes, each gets one.
+    They take turns, so that a few more of them than CPUs do not overload a machine. processes: their number.
+    at_once: number of concurrent trials. Raises ConfigError if there are far too many. If Ray's autoscaler adds nodes,
+    each gets one.
     """
     if has_autoscaler():
         return 1.0
-    nodes, count = [node.get("CPU", 0.0) for node in node_resources()], at_once * (1 + runners)
+    nodes, count = [node.get("CPU", 0.0) for node in node_resources()], at_once * processes
     # The largest share of which the nodes have enough is a whole part of one of them.
     shares = {math.floor(100 * min(1.0, cpus / parts)) for cpus in nodes for parts in range(1, count + 1)}
     fitting = [share for share in shares if share and sum(100 * cpus // share for cpus in nodes) >= count]
     if (share := max(fitting, default=0) / 100) < MIN_CPU_SHARE:
-        raise ConfigError(f"training.runners: {at_once * runners} runners are too many for {sum(nodes):g} CPUs")
+        raise ConfigError(
+            f"training.learners, training.runners: {count} processes are too many for {sum(nodes):g} CPUs"
+        )
     return share
 
 
-def placement(settings: TrainingSettings, cpus: float) -> tune.PlacementGroupFactory:
-    """Place the learner and each runner on any node that has what they need.
+def placement(used: Resources, cpus: float) -> tune.PlacementGroupFactory:
+    """Place each learner and runner on any node that has what they need.
 
-    cpus: of each. Raises ConfigError if no nodes have it, which Ray would wait for forever, unless its autoscaler adds
-    nodes.
+    cpus: of each. Raises ConfigError if there are more learners than CPUs, or if no nodes have what is needed, which
+    Ray would wait for forever, unless its autoscaler adds nodes.
     """
-    learner = settings.gpus + (settings.runner_gpus if settings.runners == 0 else 0)
-    requested = requested_gpus(settings)
-    available = sum(node.get("GPU", 0.0) for node in node_resources())
-    if requested > available and not has_autoscaler():
-        raise ConfigError(
-            f"training.gpus, training.runner_gpus: {requested:g} GPUs requested in total, but Ray has {available:g}"
-        )
-    first, runner = ({"CPU": cpus} | _gpus(gpus) for gpus in (learner, settings.runner_gpus))
+    gpus = used.gpus + (used.runner_gpus if used.runners == 0 else 0)
+    first, further, runner = ({"CPU": cpus} | _gpus(count) for count in (gpus, used.gpus, used.runner_gpus))
+    learners = [first] + [further] * (used.learners - 1)
     if not has_autoscaler():
-        _check_nodes(first, runner, settings.runners)
-    return tune.PlacementGroupFactory([first] + [runner] * settings.runners)
+        total = {name: sum(node.get(name, 0.0) for node in node_resources()) for name in ("CPU", "GPU")}
+        if used.learners > max(1, total["CPU"]):
+            raise ConfigError(
+                f"training.learners: expected at most one per CPU, got {used.learners} for {total['CPU']:g} CPUs"
+            )
+        if (requested := requested_gpus(used)) > total["GPU"]:
+            names = "training.gpus, training.runner_gpus" if used.learners == 1 else "training.learners with gpus"
+            raise ConfigError(f"{names}: {requested:g} GPUs requested in total, but Ray has {total['GPU']:g}")
+        _check_nodes(learners, runner, used.runners)
+    return tune.PlacementGroupFactory(learners + [runner] * used.runners)
 
 
-def requested_gpus(settings: TrainingSettings) -> float:
-    """Return the GPUs of the learner and of all runners."""
-    return settings.gpus + max(settings.runners, 1) * settings.runner_gpus
+def requested_gpus(used: Resources) -> float:
+    """Return the GPUs of all learners and runners."""
+    return used.learners * used.gpus + max(used.runners, 1) * used.runner_gpus
 
 
-def _check_nodes(learner: Mapping[str, float], runner: Mapping[str, float], runners: int) -> None:
-    """Raise ConfigError unless the learner fits on one node, and the runners beside it and on the others."""
+def _check_nodes(learners: Sequence[Mapping[str, float]], runner: Mapping[str, float], runners: int) -> None:
+    """Raise ConfigError unless the learners fit on the nodes, filled from one of them on, and the runners beside."""
     nodes = node_resources()
     most = -1
-    for place, node in enumerate(nodes):
-        if all(node.get(name, 0.0) >= amount for name, amount in learner.items()):
-            leftover = {name: node.get(name, 0.0) - learner.get(name, 0.0) for name in node}
-            fitting = (
-                min(math.floor(resources.get(name, 0.0) / amount + ROUNDING) for name, amount in runner.items())
-                for resources in [*nodes[:place], leftover, *nodes[place + 1 :]]
-            )
-            most = max(most, sum(fitting))
+    for place in range(len(nodes)):
+        free = [dict(node) for node in nodes[place:] + nodes[:place]]
+        if all(_take(free, learner) for learner in learners):
+            most = max(most, sum(math.floor(_fitting(node, runner)) for node in free))
     if most < runners:
-        what = f"the learner needs {_listed(learner)}" if most < 0 else f"{runners} runners need {_listed(runner)} each"
+        needs = f"the learner needs {_listed(learners[0])}"
+        if len(learners) > 1:
+            needs = f"{len(learners)} learners need {_listed(learners[0])} each"
+        what = needs if most < 0 else f"{runners} runners need {_listed(runner)} each"
         have = "; ".join(_listed({name: node.get(name, 0.0) for name in ("CPU", "GPU")}) for node in nodes)
         raise ConfigError(f"training: {what}, but the nodes of the Ray cluster have {have}")
+
+
+def _take(nodes: Iterable[dict[str, float]], resources: Mapping[str, float]) -> bool:
+    """Subtract resources from the first node that has them; return whether there is one."""
+    for node in nodes:
+        if _fitting(node, resources) >= 1:
+            node.update({name: node[name] - amount for name, amount in resources.items()})
+            return True
+    return False
+
+
+def _fitting(node: Mapping[str, float], resources: Mapping[str, float]) -> float:
+    """Return how often resources fit on a node."""
+    return min(node.get(name, 0.0) / amount + ROUNDING for name, amount in resources.items())
 
 
 def _listed(resources: Mapping[str, float]) -> str:

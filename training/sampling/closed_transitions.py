@@ -283,12 +283,23 @@ class JointTransitionsWithoutState(JointTransitions):
     keeps_states = False
 
 
-def state_size(environment: EnvironmentConfig, interface: Interface) -> int:
-    """Return s, the size of `state` in an environment. Raises ConfigError if the environment cannot be created."""
+def own_state_size(environment: EnvironmentConfig) -> int | None:
+    """Return the size of an environment's `state()`; None if it has none.
+
+    Raises ConfigError if the environment cannot be created.
+    """
+    if environment.external is not None:
+        return None
     with closing(stock_stepping(environment, 1, states=True)) as batched:
         turn = batched.start(each_agent_alone([0], len(batched.agents)))
-    if turn.states is not None:
-        return turn.states.values.shape[1]
+    return None if turn.states is None else turn.states.values.shape[1]
+
+
+def state_size(environment: EnvironmentConfig, interface: Interface) -> int:
+    """Return s, the size of `state` in an environment. Raises what `own_state_size` raises."""
+    size = own_state_size(environment)
+    if size is not None:
+        return size
     return sum(
         math.prod(leaf.shape)
         for agent in interface.agents

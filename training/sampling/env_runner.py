@@ -1,8 +1,10 @@
 """Samples episodes: an RLlib EnvRunner on the batched stepping of environments."""
 
 import gc
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -22,11 +24,14 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME, WEIGHTS_SEQ_
 
 from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
+from league.config.ppo import PPOConfig
 from league.environments.implementation import stepping
+from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import ConfigError, LeagueError
 from league.interface import Interface
 from league.random.seeds import generator
+from league.registry.gateways import ForSimulators
 from league.results.scoring import scoring
 from league.spaces import inputs
 from league.spaces.conversion import to_gymnasium
@@ -35,11 +40,17 @@ from training.sampling.episode_chunks import EpisodeChunks, as_episodes
 from training.sampling.recorder import EpisodeRecorder
 from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.self_play import ForwardInput, ForwardOutput, SelfPlay
+from training.sampling.teacher import Teacher
 
 LEAGUE = "league"
 INTERFACE = "interface"
 STORAGE = "storage"
 """Keys of `env_config`: a LeagueConfig and an Interface, dumped; the Storage of opponents, or None."""
+
+FINISHED_EPISODES = "finished_episodes"
+"""In a runner's metrics if there are callbacks: its PlayedEpisodes since the last call."""
+SAMPLING_SECONDS, IDLE_SECONDS = "sampling_seconds", "idle_seconds"
+"""Wall time of a runner's samples, and between them."""
 
 Spaces = dict[str, tuple[gymnasium.Space, gymnasium.Space]]
 
@@ -61,9 +72,14 @@ class BatchedEnvRunner(RaisingEnvRunner):
     worker_index: int
     _play: SelfPlay | None = None
     _opponents: tuple[OpponentConfig, ...] = ()
+    _teacher: Teacher | None = None
+    _stage = 0
+    _sampling_seconds = _idle_seconds = 0.0
+    _idle_since: float | None = None
+    """The end of the last sample; None if what follows is no idle time: a checkpoint is saved, or nothing sampled."""
 
     def __init__(self, config: AlgorithmConfig, **kwargs: Any) -> None:
-        """Raises ConfigError if the environment, its opponents or a requested GPU are not available."""
+        """Raises ConfigError if the environment, its opponents, a requested GPU or the teacher are not available."""
         super().__init__(config=config, **kwargs)
         self.league = LeagueConfig.model_validate(self.config.env_config[LEAGUE])
         self.interface = Interface.model_validate(self.config.env_config[INTERFACE])
@@ -73,25 +89,35 @@ class BatchedEnvRunner(RaisingEnvRunner):
         self.make_module()
         if self._samples:
             self.make_env()
-            # Some environments create reference cycles at every reset. Without freezing, each collection would
-            # traverse everything that Ray and torch have loaded.
-            gc.freeze()
+            settings = self.league.training
+            if isinstance(settings, PPOConfig) and settings.teacher is not None:
+                storage = self.config.env_config.get(STORAGE)
+                self._teacher = Teacher(settings.teacher, self.interface, storage, settings.seed)
 
     def make_env(self) -> None:
         """Create the environments, after closing previous ones."""
         self.stop()
+        storage = self.config.env_config.get(STORAGE)
         with self._errors_with_league():
             num_envs, crashes = self.config.num_envs_per_env_runner, self.league.training.crashes
-            self.env = stepping(
-                self.league.environment,
-                num_envs,
-                crashes=crashes,
-                states=self.gives_states,
-                fast_seeds=self.league.training.seeds == "fast",
-            )
+            critic = self.league.training.critic if isinstance(self.league.training, PPOConfig) else "own"
+            stages, environment = self.league.training.curriculum, self.league.stage_environment(self._stage)
+            states = self.gives_states or critic == "state"
+            if stages and stages[self._stage].is_random:  # a vectorised environment has the same arguments throughout
+                of_seed = partial(self.league.stage_environment, self._stage)
+                self.env = stock_stepping(environment, num_envs, crashes=crashes, states=states, of_seed=of_seed)
+            else:
+                fast_seeds = self.league.training.seeds == "fast"
+                self.env = stepping(
+                    environment,
+                    num_envs,
+                    crashes=crashes,
+                    states=states,
+                    fast_seeds=fast_seeds,
+                    simulators=None if storage is None else ForSimulators(storage, self.league.league, "training"),
+                )
             initial = initial_states(self.module)
-            storage = self.config.env_config.get(STORAGE)
-            self._chunks = EpisodeRecorder(self.interface, self.env.agents, num_envs)
+            self._chunks = EpisodeRecorder(self.interface, self.env.agents, num_envs, critic)
             self._play = SelfPlay(
                 self.env,
                 self.interface,
@@ -103,6 +129,9 @@ class BatchedEnvRunner(RaisingEnvRunner):
                 opening_plies=self.league.training_openings,
             )
         self._has_begun = False
+        # Some environments create reference cycles at every reset. Without freezing, each collection would traverse
+        # everything that Ray and torch have loaded.
+        gc.freeze()
 
     def make_module(self) -> None:
         """Build the policies' modules from the configuration."""
@@ -142,6 +171,7 @@ class BatchedEnvRunner(RaisingEnvRunner):
         explore: bool | None = None,
         random_actions: bool = False,
         force_reset: bool = False,
+        taught: Collection[str] = (),
         **_: Any,
     ) -> list[EpisodeChunks]:
         """Play, and return all completed transitions, at least one: the chunks of each policy.
@@ -152,6 +182,7 @@ class BatchedEnvRunner(RaisingEnvRunner):
             explore: Sample actions instead of taking the most probable ones; by default as configured.
             random_actions: Take uniform legal actions instead of the module's.
             force_reset: Drop the open episodes first.
+            taught: The policies on whose steps the teacher acts, too.
         """
         assert num_timesteps is None or num_episodes is None, "num_timesteps and num_episodes are mutually exclusive"
         assert self._play is not None, "a runner that only holds weights cannot sample"
@@ -173,7 +204,10 @@ class BatchedEnvRunner(RaisingEnvRunner):
                 play.step(forward, explore)
             while not (chunks := self._chunks.cut()):
                 play.step(forward, explore)
-        return chunks
+        if not taught:
+            return chunks
+        assert self._teacher is not None, "the league has no teacher"
+        return [replace(part, taught=self._teacher.actions(part)) if part.policy in taught else part for part in chunks]
 
     def reset_episodes(self, steps: int) -> None:
         """Drop all open episodes. Further play depends on the weights, the run's seed, and `steps` only.
@@ -192,6 +226,15 @@ class BatchedEnvRunner(RaisingEnvRunner):
         with self._errors_with_league():
             self._play.begin(seeds, generator(seed, "play", seeds.runner, steps), self._opponents)
         self._has_begun = True
+        self._idle_since = None
+
+    def enter_stage(self, stage: int) -> None:
+        """Play in the environment of a stage of the curriculum, from 0. Episodes must be reset afterwards."""
+        if stage == self._stage:
+            return
+        self._stage = stage
+        if self._samples:
+            self.make_env()
 
     def exchange_opponents(self, opponents: Sequence[OpponentConfig]) -> None:
         """Replace the opponents from the league in new episodes. Raises what loading them raises."""
@@ -206,8 +249,14 @@ class BatchedEnvRunner(RaisingEnvRunner):
         """Return statistics since the last call, per policy and in total."""
         if self._play is not None:
             self._play.log(self.metrics)
+        self.metrics.log_value(SAMPLING_SECONDS, self._sampling_seconds, reduce="sum")
+        self.metrics.log_value(IDLE_SECONDS, self._idle_seconds, reduce="sum")
+        self._sampling_seconds = self._idle_seconds = 0.0
         self.metrics.log_value(WEIGHTS_SEQ_NO, self._weights_seq_no, window=1)
-        return self.metrics.reduce()
+        metrics = self.metrics.reduce()
+        if self.league.training.callbacks and self._play is not None and self._play.metrics.logged is not None:
+            metrics[FINISHED_EPISODES] = self._play.metrics.logged
+        return metrics
 
     def get_state(
         self,
@@ -266,6 +315,18 @@ class BatchedEnvRunner(RaisingEnvRunner):
     @property
     def _weights_seq_no(self) -> int:
         return max(self._weights_from.values(), default=0)
+
+    @contextmanager
+    def timed_sample(self) -> Iterator[None]:
+        """Measure how long the block takes, which samples, and how long the runner was idle before it."""
+        began = time.perf_counter()
+        if self._idle_since is not None:
+            self._idle_seconds += began - self._idle_since
+        try:
+            yield
+        finally:
+            self._idle_since = time.perf_counter()
+            self._sampling_seconds += self._idle_since - began
 
     @contextmanager
     def _errors_with_league(self) -> Iterator[None]:

@@ -1,7 +1,7 @@
 """Sampled steps of one policy in columns, and their conversion to RLlib's episodes."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from league.environments.stepping import Indices
 from training.rllib_compat import ChunkColumn, EpisodeChunk
 
 NO_INFO: dict[str, object] = {}
+PASS_ROWS = 2048
+"""Rows per forward pass over a sample: more than a few thousand images as floats would exhaust memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,8 @@ class EpisodeChunks:
         rewards: (n,) float32.
         terminated: (c,) bool.
         truncated: (c,) bool; never both. A chunk with neither flag was cut.
+        taught: The teacher's raw actions, as `actions`; None if it did not act.
+        central: What a central critic gets besides the observations, column → (n + c, …).
     """
 
     name: str
@@ -49,6 +53,16 @@ class EpisodeChunks:
     rewards: NDArray[np.float32]
     terminated: NDArray[np.bool_]
     truncated: NDArray[np.bool_]
+    taught: NDArray[np.int64] | None = None
+    central: Mapping[str, NDArray] = field(default_factory=dict)
+
+
+def acted_rows(lengths: Indices) -> Indices:
+    """Return the rows of the steps among the observations of consecutive chunks, (n,): all but each chunk's last.
+
+    lengths: see EpisodeChunks.
+    """
+    return np.delete(np.arange(lengths.sum() + len(lengths)), np.cumsum(lengths + 1) - 1)
 
 
 def as_episodes(chunks: EpisodeChunks, agents: Sequence[str]) -> Iterator[SingleAgentEpisode]:

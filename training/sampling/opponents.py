@@ -136,10 +136,13 @@ class Openings:
         self._left[envs], self._waiting[envs] = rng.integers(self._plies + 1, size=len(envs)), groups
         return np.where(self._left[envs, np.newaxis] > 0, self._movers, groups)
 
-    def step(self) -> tuple[Indices, Indices]:
-        """Count a step in all environments. Return those whose opening ends with it, and their groups after it."""
-        ended = np.flatnonzero(self._left == 1)
-        self._left = np.maximum(self._left - 1, 0)
+    def step(self, acting: NDArray[np.bool_]) -> tuple[Indices, Indices]:
+        """Count a step in some environments. Return those whose opening ends with it, and their groups after it.
+
+        acting: (environments,).
+        """
+        ended = np.flatnonzero((self._left == 1) & acting)
+        self._left = np.maximum(self._left - acting, 0)
         return ended, self._waiting[ended]
 
 

@@ -76,6 +76,8 @@ class PlayMetrics:
         self.episodes = 0
         """Episodes finished since the runner started."""
         self._logged_steps = self._logged_episodes = 0
+        self.logged: PlayedEpisodes | None = None
+        """The episodes of the last `log`, if any."""
         self._clear()
 
     def add_play(self, policy: str, dist_inputs: NDArray) -> None:
@@ -86,9 +88,9 @@ class PlayMetrics:
         """Add a number of actions, whoever took them."""
         self.steps += moves
 
-    def add_step(self) -> None:
-        """Count a step in all environments."""
-        self._lengths += 1
+    def add_step(self, acting: NDArray[np.bool_]) -> None:
+        """Count a step in some environments. acting: (environments,)."""
+        self._lengths += acting
 
     def add_turn(self, turn: Turn, own_policies: int) -> None:
         """Add what has ended, and the rewards of agents that must act.
@@ -137,12 +139,11 @@ class PlayMetrics:
             metrics.log_value((policy, ENTROPY), entropy, window=1)
             metrics.log_value((NUM_MODULE_STEPS_SAMPLED, policy), len(dist_inputs), reduce="sum")
             metrics.log_value((NUM_MODULE_STEPS_SAMPLED_LIFETIME, policy), len(dist_inputs), reduce="lifetime_sum")
-        if self._finished:
-            self._log_episodes(metrics)
+        self.logged = self._log_episodes(metrics) if self._finished else None
         self._logged_steps, self._logged_episodes = self.steps, self.episodes
         self._clear()
 
-    def _log_episodes(self, metrics: MetricsLogger) -> None:
+    def _log_episodes(self, metrics: MetricsLogger) -> PlayedEpisodes:
         finished = PlayedEpisodes(
             np.concatenate([played.lengths for played in self._finished]),
             np.concatenate([played.steps for played in self._finished]),
@@ -166,6 +167,7 @@ class PlayMetrics:
         for policy in dict.fromkeys(self._policies):
             agents = [index for index, agent_policy in enumerate(self._policies) if agent_policy == policy]
             _log_means(metrics, EPISODE_MODULE_RETURN_MEAN, EPISODE_MODULE_LEN_MEAN, policy, finished, agents)
+        return finished
 
     def _clear(self) -> None:
         self._plays: dict[str, list[NDArray]] = defaultdict(list)

@@ -8,14 +8,17 @@ same row: no step is lost or counted twice, and a cut chunk is bootstrapped from
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from league.config.ppo import Critic
 from league.environments.stepping import Indices, Turn
 from league.environments.vector.vector_env import AgentRows
 from league.interface import Interface
+from training.sampling.central_observations import CENTRAL, central_observer
 from training.sampling.episode_chunks import EpisodeChunks
 from training.sampling.reset_seeds import ResetSeeds
 
@@ -195,7 +198,9 @@ class ChunkBuilder:
             agents=layout.slots[is_whole] % self._agents,
             started=layout.started[is_whole],
             lengths=steps[is_whole],
-            observations={name: array[observation_rows] for name, array in observations.items()},
+            observations={
+                name: array[observation_rows] for name, array in observations.items() if not name.startswith(CENTRAL)
+            },
             actions=played[ACTIONS][action_rows],
             log_p=played[LOG_P][action_rows],
             dist_inputs=played[DIST_INPUTS][action_rows],
@@ -207,6 +212,7 @@ class ChunkBuilder:
             rewards=layout.rewards[is_rewarded].astype(np.float32),
             terminated=terminated[layout.ends[is_whole]],
             truncated=truncated[layout.ends[is_whole]],
+            central={name: array[observation_rows] for name, array in observations.items() if name.startswith(CENTRAL)},
         )
 
 
@@ -243,8 +249,10 @@ class Recorder(Protocol):
 class EpisodeRecorder:
     """Records episode chunks, one agent's steps each."""
 
-    def __init__(self, interface: Interface, agents: Sequence[str], num_envs: int) -> None:
+    def __init__(self, interface: Interface, agents: Sequence[str], num_envs: int, critic: Critic = "own") -> None:
+        """critic: for which critic to record what it gets."""
         self._agents, self._num_envs = len(agents), num_envs
+        self._new_observer = partial(central_observer, critic, interface, agents, num_envs)
         self._learning = interface.policy_ids
         self._policy_of = np.array([self._learning.index(interface.policies[agent]) for agent in agents])
         self._names: Iterator[str] = iter(())
@@ -254,8 +262,11 @@ class EpisodeRecorder:
 
     def restart(self) -> None:
         self._builders = [ChunkBuilder(policy, self._agents, self._num_envs) for policy in self._learning]
+        self._observer = self._new_observer()
 
     def read(self, turn: Turn) -> None:
+        if self._observer is not None:
+            turn = self._observer.extended(turn)
         if len(turn.crashed):
             for builder in self._builders:
                 builder.discard(turn.crashed)

@@ -48,7 +48,7 @@ class ReplayRunner(BatchedEnvRunner):
         play = self._play
         for module in self.module.values():
             module.exploration = exploration
-        with self._errors_with_league(), one_thread():
+        with self.timed_sample(), self._errors_with_league(), one_thread():
             if not self._has_begun:
                 self.reset_episodes(self.num_env_steps_sampled_lifetime)
             before, forward = play.metrics.steps, partial(self._forward, self.module.forward_exploration)

@@ -174,8 +174,9 @@ class SelfPlay:
                 forward_input = forward_inputs[controller]
                 actions[group] = self._act(controller, batch, forward_input, outputs.get(controller), explore)
             self.metrics.add_moves(len(batch))
-        self._stepping.assign(*self._openings.step())
-        self.metrics.add_step()
+        acting = self._turn.acting(self._stepping.num_envs)
+        self._stepping.assign(*self._openings.step(acting))
+        self.metrics.add_step(acting)
         self._read(self._stepping.step(actions))
 
     def _next_episodes(self, envs: Indices) -> Starts:

@@ -1,7 +1,8 @@
 """The directory of a sweep, from which it can be resumed.
 
 <home>/sweeps/<league>/<sweep>/
-    sweep.json          the sweep's trials; written before the first trial and on completion
+    sweep.json          the sweep's trials; written before the first trial, before each that Optuna proposes, and on
+                        completion
     lock                held while a driver works on the sweep
     stop                created to request that the trials save and end
     trial-<number>/     Tune's trial and its TensorBoard files
@@ -23,11 +24,14 @@ from league.errors import ConfigError, NotFound
 from league.files import disk_errors
 from league.frozen import FrozenModel
 from league.settings import Storage
+from training.algorithms.resources import Resources
 from training.runs.run_directory import CHECKPOINTS, STOP_FILE, changed_setting, locked, with_pins, write
-from training.sweeps.search_space import Settings, applied
+from training.sweeps.search_space import Settings, TrialOutcome, applied, size
 
 SWEEP_FILE = "sweep.json"
 OUTCOME_FILE = "outcome.json"
+SEARCH_SETTINGS = {"parameters", "search", "samples", "mode"}
+"""Settings of `sweep` that decide what the trials are, and cannot change in a resumed sweep."""
 
 
 class SweepRecord(FrozenModel):
@@ -36,28 +40,14 @@ class SweepRecord(FrozenModel):
     config: LeagueConfig
     pins: dict[str, str]
     trials: tuple[Settings, ...]
-    """The settings of each trial."""
+    """The settings of each trial; with Optuna, of those that have started."""
+    resources: tuple[Settings, ...] = ()
+    """What each trial uses in place of `auto`."""
     opponents: tuple[str, ...] = ()
     """Whom the strength of trials is measured against, as fixed references; empty with another metric."""
     git_commit: str | None
     started_at: datetime
     complete: bool = False
-
-
-class TrialOutcome(FrozenModel, allow_inf_nan=False):
-    """The result of a trial.
-
-    score: the mean metric of its last reports, or its last strength; None without values. low, high: the bounds of the
-    strength's 95 % interval.
-    """
-
-    score: float | None
-    low: float | None = None
-    high: float | None = None
-    steps: int
-    seconds: float
-    ended_early: bool
-    """By the scheduler, because other trials were better."""
 
 
 class SweepDirectory:
@@ -91,14 +81,16 @@ class SweepDirectory:
         trials: list[Settings],
         git_commit: str | None,
         opponents: Sequence[str] = (),
+        resources: Sequence[Resources] = (),
     ) -> Self:
-        """Create the directory of a new sweep. trials: the settings of each. opponents: see `SweepRecord`."""
+        """Create the directory of a new sweep. trials: the settings of each. Others: see `SweepRecord`."""
         started_at = datetime.now(UTC)
         path = _sweeps(storage, config.league) / f"{started_at:%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
         record = SweepRecord(
             config=with_pins(config, pins),
             pins=pins,
             trials=tuple(trials),
+            resources=tuple(used.settings for used in resources),
             opponents=tuple(opponents),
             git_commit=git_commit,
             started_at=started_at,
@@ -109,7 +101,7 @@ class SweepDirectory:
         return cls(path, record)
 
     @classmethod
-    def resume(cls, storage: Storage, config: LeagueConfig, trials: list[Settings]) -> Self:
+    def resume(cls, storage: Storage, config: LeagueConfig) -> Self:
         """Open the league's newest sweep if it is incomplete. Raises NotFound; ConfigError if `config` differs."""
         sweeps = _sweeps(storage, config.league)
         newest = max(sweeps.glob(f"*/{SWEEP_FILE}"), default=None)
@@ -119,19 +111,40 @@ class SweepDirectory:
         if record.complete:
             raise NotFound(f"sweep {newest.parent.name} is complete: there is nothing to resume")
         changed = changed_setting(record.config, with_pins(config, record.pins))
-        if changed is None and list(record.trials) != trials:
+        before, after = (
+            None if league.sweep is None else league.sweep.model_dump(include=SEARCH_SETTINGS)
+            for league in (record.config, config)
+        )
+        if changed is None and before != after:
             changed = "sweep"
         if changed is not None:
             raise ConfigError(f"{changed} has changed since sweep {newest.parent.name} began: start a new one")
         return cls(newest.parent, record)
+
+    @property
+    def size(self) -> int:
+        """The number of trials, including those that Optuna has not proposed yet."""
+        return size(self.settings, self.record.trials)
+
+    def add(self, settings: Settings, used: Resources, pins: dict[str, str]) -> None:
+        """Record the settings of the next trial before it starts. References that are already pinned stay."""
+        record = self.record
+        changes = {
+            "trials": (*record.trials, settings),
+            "resources": (*record.resources, used.settings),
+            "pins": pins | record.pins,
+        }
+        self.record = record.model_copy(update=changes)
+        write(self.record, self.path / SWEEP_FILE)
 
     def locked(self) -> AbstractContextManager[None]:
         """Exclude other drivers. Raises AlreadyRunning. The lock ends with the process."""
         return locked(self.path, f"sweep {self.path.name}")
 
     def league(self, number: int) -> LeagueConfig:
-        """Return the league with a trial's settings, and with pinned opponents."""
-        return with_pins(applied(self.record.config, self.record.trials[number]), self.record.pins)
+        """Return the league with a trial's settings and resources, and with pinned opponents."""
+        league = with_pins(applied(self.record.config, self.record.trials[number]), self.record.pins)
+        return league.with_training(**self.record.resources[number]) if self.record.resources else league
 
     def trial(self, number: int) -> Path:
         """Return the directory of a trial."""

@@ -1,22 +1,26 @@
 """A trial of a sweep, the driver's callback, and the display of progress."""
 
 from collections import defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from ray import tune
 from ray.tune.experiment import Trial as TuneTrial
+from ray.tune.search import Searcher
 from rich.console import Console
 from rich.progress import TextColumn, TimeRemainingColumn
 
+from league.config.base import JSON
 from league.errors import LeagueError
+from league.interface import Interface
 from training.rllib_compat import NotPickled
 from training.runs.progress import ProgressDisplay, clock
-from training.runs.trial import Trial
-from training.sweeps.search_space import format_settings
+from training.runs.trial import Trial, TrialPlan
+from training.sweeps.search_space import TrialOutcome, format_settings
 from training.sweeps.strength import HIGH, LOW, STRENGTH, StrengthTest, trial_strength
-from training.sweeps.sweep_directory import SweepDirectory, TrialOutcome
+from training.sweeps.sweep_directory import SweepDirectory
 
 
 class SweepProgress(ProgressDisplay):
@@ -24,13 +28,13 @@ class SweepProgress(ProgressDisplay):
 
     def __init__(self, console: Console, sweep: SweepDirectory, mode: str) -> None:
         super().__init__(console, TimeRemainingColumn(), TextColumn("{task.fields[best]}"))
-        self._trials = sweep.record.trials
+        self._sweep = sweep
         self._sign = 1 if mode == "max" else -1
-        over = {number: outcome for number in range(len(self._trials)) if (outcome := sweep.outcome(number))}
+        over = {number: outcome for number in range(sweep.size) if (outcome := sweep.outcome(number))}
         self._outcomes = dict(over)
         self._done = dict.fromkeys(over, 1.0)
         self._over = len(over)
-        self._bar = self._bars.add_task("", total=len(self._trials), best="")
+        self._bar = self._bars.add_task("", total=sweep.size, best="")
         self._show()
 
     def update(self, number: int, outcome: TrialOutcome, done: float) -> None:
@@ -45,7 +49,8 @@ class SweepProgress(ProgressDisplay):
         self._show()
         early = ", ended early" if outcome.ended_early else ""
         self.say(
-            f"{self._over} of {len(self._trials)}: trial {number} ({format_settings(self._trials[number])}): "
+            f"{self._over} of {self._sweep.size}: trial {number} "
+            f"({format_settings(self._sweep.record.trials[number])}): "
             f"{format_score(outcome)} after {outcome.steps:,} steps, {clock(outcome.seconds)}{early}"
         )
 
@@ -53,7 +58,7 @@ class SweepProgress(ProgressDisplay):
         scores = {number: outcome.score for number, outcome in self._outcomes.items() if outcome.score is not None}
         best = max(scores, key=lambda number: self._sign * scores[number], default=None)
         summary = "" if best is None else f"best: trial {best} with {format_score(self._outcomes[best])}"
-        description = f"{self._over} of {len(self._trials)} trials"
+        description = f"{self._over} of {self._sweep.size} trials"
         self._bars.update(self._bar, completed=sum(self._done.values()), description=description, best=summary)
 
 
@@ -68,22 +73,54 @@ def format_score(outcome: TrialOutcome) -> str:
 
 TRIAL = "trial"
 NUMBER = "number"
+ARGUMENTS = "arguments"
 SCORE_REPORTS = 5
 """Number of last reports whose mean is a trial's score: a single one is noisy. Of strength, only the last one counts,
 which has an interval."""
 
 
+@dataclass(frozen=True, slots=True, repr=False)
+class TrialArguments:
+    """What a Trial is built from. Not a dictionary, whose items Tune would show among the settings of the trial."""
+
+    league: JSON
+    """Its algorithm is imported before its settings are read."""
+    interface: Interface
+    plan: TrialPlan
+
+
+class PlannedTrials(NotPickled, Searcher):
+    """Gives Tune the configurations that `trials` yields, each when it can start.
+
+    Saves nothing: the state of the trials is in the sweep's directory.
+    """
+
+    def __init__(self, trials: Iterator[dict[str, Any]]) -> None:
+        super().__init__()
+        self._trials = trials
+
+    def suggest(self, _: str) -> dict[str, Any] | str:
+        return next(self._trials, Searcher.FINISHED)
+
+    def on_trial_complete(self, *_: Any, **__: Any) -> None:
+        """Do nothing: SweepCallback records the outcome."""
+
+    def save(self, _: str) -> None:
+        """Do nothing."""
+
+
 class SweepTrial(Trial):
     """A Trial that keeps its newest checkpoint only, and repeats the metric's last value, since schedulers require one.
 
-    config: `trial`, its number and settings. plans: number → configuration of the Trial. strength: how its strength is
-    measured at each checkpoint, if that is the metric.
+    config: `trial`, its number and settings, and `arguments`. strength: how its strength is measured at each
+    checkpoint, if that is the metric.
     """
 
     def setup(  # type: ignore[override]  # Tune's with_parameters passes the others
-        self, config: dict[str, Any], plans: Mapping[int, dict[str, Any]], metric: str, strength: StrengthTest | None
+        self, config: dict[str, Any], metric: str, strength: StrengthTest | None
     ) -> None:
-        super().setup(plans[config[TRIAL][NUMBER]])
+        arguments: TrialArguments = config[ARGUMENTS]
+        super().setup({field.name: getattr(arguments, field.name) for field in fields(arguments)})
         self._metric = metric
         self._strength = strength
         self._games = None if strength is None else strength.open_games(self.plan.storage)

@@ -238,6 +238,14 @@ class NoEvaluationService(NotReady, code="no_evaluation_service"):
     """The server was deployed without an evaluation service, or the service is unreachable."""
 
 
+class NoSearchService(NotReady, code="no_search_service"):
+    """The server was deployed without a search service."""
+
+
+class NoSimulation(NotReady, code="no_simulation"):
+    """No training run or evaluation needs episodes of simulators."""
+
+
 class NoReplica(NotReady, code="no_replica"):
     """No replica of a policy server accepts requests."""
 

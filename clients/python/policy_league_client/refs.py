@@ -85,14 +85,6 @@ def check_alias(text: str) -> str:
     return check_slug("alias", text)
 
 
-def _check_entry_point(text: str) -> str:
-    if len(text) > MAX_ENTRY_POINT:
-        raise InvalidReference(f"bot {text[:32]!r}… has {len(text)} characters, expected at most {MAX_ENTRY_POINT}")
-    if not ENTRY_POINT.fullmatch(text):
-        raise InvalidReference(f"bot {text!r} must be my_package.module:name")
-    return text
-
-
 @dataclass(frozen=True, slots=True)
 class CheckpointRef:
     """A version of a league, by number or by alias."""
@@ -127,7 +119,13 @@ class ScriptRef:
         scheme, _, name = text.partition(":")
         if scheme != "script":
             raise InvalidReference(f"{text!r} is not a script: expected script:NAME")
-        return cls(_check_entry_point(name) if ":" in name else check_slug("script", name))
+        if ":" not in name:
+            return cls(check_slug("script", name))
+        if len(name) > MAX_ENTRY_POINT:
+            raise InvalidReference(f"bot {name[:32]!r}… has {len(name)} characters, expected at most {MAX_ENTRY_POINT}")
+        if not ENTRY_POINT.fullmatch(name):
+            raise InvalidReference(f"bot {name!r} must be my_package.module:name")
+        return cls(name)
 
     def __str__(self) -> str:
         return f"script:{self.name}"

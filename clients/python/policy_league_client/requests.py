@@ -123,11 +123,13 @@ class ActionRequest:
         seed: int | None = None,
         probabilities: bool = False,
         state: str | None = None,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
     ) -> "ActionRequest":
         """For the arguments see `Client.act`. Raises InvalidInput."""
         used_seed = _used_seed(explore, seed)
         body = {"observation": encode(observation, encoding)}
-        return cls(_body(body, explore, used_seed, probabilities, state), used_seed)
+        return cls(body | _options(explore, used_seed, probabilities, state, deadline_ms, analysis), used_seed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +149,15 @@ class BatchActionRequest:
         seed: int | Sequence[int] | None = None,
         probabilities: bool = False,
         state: Sequence[str | None] | None = None,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
     ) -> "BatchActionRequest":
         """For the arguments see `Client.act_batch`. Raises InvalidInput."""
         requested_seed: int | list[int] | None = list(seed) if isinstance(seed, Sequence) else seed
         used_seed = _used_seed(explore, requested_seed)
         states = None if state is None else list(state)
         body = {"observations": [encode(row, encoding) for row in split_batch(observations)]}
-        return cls(_body(body, explore, used_seed, probabilities, states), used_seed)
+        return cls(body | _options(explore, used_seed, probabilities, states, deadline_ms, analysis), used_seed)
 
 
 Seed = TypeVar("Seed", bound=int | list[int])
@@ -166,14 +170,16 @@ def _used_seed(explore: bool | None, seed: Seed | None) -> Seed | int | None:
     return random.getrandbits(63) if seed is None else seed
 
 
-def _body(body: JsonObject, explore: bool | None, seed: Any, probabilities: bool, state: Any) -> JsonObject:
-    """Adds the fields that differ from their defaults."""
-    if explore is not None:
-        body["explore"] = explore
-    if seed is not None:
-        body["seed"] = seed
-    if probabilities:
-        body["probabilities"] = True
-    if state is not None:
-        body["state"] = state
-    return body
+def _options(
+    explore: bool | None, seed: Any, probabilities: bool, state: Any, deadline_ms: int | None, analysis: bool
+) -> JsonObject:
+    """Return the fields that differ from their defaults."""
+    options = {
+        "explore": explore,
+        "seed": seed,
+        "probabilities": probabilities or None,
+        "state": state,
+        "deadline_ms": deadline_ms,
+        "analysis": analysis or None,
+    }
+    return {name: value for name, value in options.items() if value is not None}

@@ -51,6 +51,21 @@ Probabilities = Any
 
 
 @dataclass(frozen=True, slots=True)
+class SearchAnalysis:
+    """What a search expects in a position.
+
+    Attributes:
+        value: Expected return of the agent that must act.
+        visits: Simulations through each action.
+        line: The expected actions of all agents, from this one on.
+    """
+
+    value: float
+    visits: list[int]
+    line: list[int]
+
+
+@dataclass(frozen=True, slots=True)
 class ActionResponse:
     """An action and its origin.
 
@@ -63,6 +78,8 @@ class ActionResponse:
             give the same action again. None with `explore=False`.
         probabilities: Action probabilities, if requested; see `Probabilities`.
         state: Recurrent state for the next observation, as an opaque token; None for policies without state.
+        simulations: Positions that a search version evaluated besides the current one; None for other versions.
+        analysis: What the search expects, if requested.
     """
 
     action: Any
@@ -72,6 +89,8 @@ class ActionResponse:
     seed: int | None = None
     probabilities: Probabilities | None = None
     state: str | None = None
+    simulations: int | None = None
+    analysis: SearchAnalysis | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +105,8 @@ class BatchActionResponse:
         seed: One seed for the batch, or one for each observation.
         probabilities: Action probabilities of each observation, if requested.
         state: Recurrent state of each observation.
+        simulations: Those of each observation; None unless a search version answered.
+        analysis: What the search expects in each position, if requested.
     """
 
     actions: list[Any]
@@ -95,6 +116,8 @@ class BatchActionResponse:
     seed: int | list[int] | None = None
     probabilities: list[Probabilities] | None = None
     state: list[str] | None = None
+    simulations: list[int] | None = None
+    analysis: list[SearchAnalysis] | None = None
 
     def response(self, row: int) -> ActionResponse:
         """Return the response to one observation.
@@ -109,12 +132,14 @@ class BatchActionResponse:
             self.seed[row] if isinstance(self.seed, list) else self.seed,
             None if self.probabilities is None else self.probabilities[row],
             None if self.state is None else self.state[row],
+            None if self.simulations is None else self.simulations[row],
+            None if self.analysis is None else self.analysis[row],
         )
 
 
 def parse_action_response(body: Mapping[str, Any], replica: str, seed: int | None) -> ActionResponse:
     """Parse the response to one observation."""
-    probabilities = body.get("probabilities")
+    probabilities, analysis = body.get("probabilities"), body.get("analysis")
     return ActionResponse(
         decode_action(body["action"]),
         body["version"],
@@ -123,6 +148,8 @@ def parse_action_response(body: Mapping[str, Any], replica: str, seed: int | Non
         seed,
         None if probabilities is None else _decode_probabilities(probabilities),
         body.get("state"),
+        body.get("simulations"),
+        None if analysis is None else _decode_analysis(analysis),
     )
 
 
@@ -130,7 +157,7 @@ def parse_batch_action_response(
     body: Mapping[str, Any], replica: str, seed: int | list[int] | None
 ) -> BatchActionResponse:
     """Parse the response to a batch."""
-    probabilities = body.get("probabilities")
+    probabilities, analyses = body.get("probabilities"), body.get("analysis")
     return BatchActionResponse(
         [decode_action(action) for action in body["actions"]],
         body["version"],
@@ -139,6 +166,8 @@ def parse_batch_action_response(
         seed,
         None if probabilities is None else [_decode_probabilities(distribution) for distribution in probabilities],
         body.get("state"),
+        body.get("simulations"),
+        None if analyses is None else [_decode_analysis(analysis) for analysis in analyses],
     )
 
 
@@ -161,3 +190,7 @@ def _decode_probabilities(value: Any) -> Probabilities:
     if value and isinstance(value[0], list):
         return [np.asarray(component) for component in value]
     return np.asarray(value)
+
+
+def _decode_analysis(document: Mapping[str, Any]) -> SearchAnalysis:
+    return SearchAnalysis(document["value"], document["visits"], document["line"])

@@ -6,7 +6,6 @@ response, because messages without a response were not applied.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import httpx
 import orjson
@@ -85,7 +84,10 @@ class StreamProtocol:
         if self._has_state:
             body["return_state"] = True
         if self._is_new and self._state is not None and reset is not True:
-            body["state"] = self._state_to_resume(reset)
+            body["state"] = self._state
+            # Rows in which an episode starts have no state.
+            if isinstance(reset, list) and isinstance(self._state, list):
+                body["state"] = [None if starts else state for starts, state in zip(reset, self._state, strict=False)]
         elif reset:
             body["reset"] = reset
         return to_json(body).decode()
@@ -137,9 +139,3 @@ class StreamProtocol:
         if isinstance(outcome, httpx.Response):
             raise parse_error(outcome, self.url)
         raise RemoteError(f"{self.url}: {outcome}") from outcome
-
-    def _state_to_resume(self, reset: bool | list[bool]) -> Any:
-        """The state to continue from, None for each row in which an episode starts."""
-        if not isinstance(reset, list) or not isinstance(self._state, list):
-            return self._state
-        return [None if starts else state for starts, state in zip(reset, self._state, strict=False)]

@@ -37,7 +37,7 @@ from league.results.records import Match, Schedule
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnchorReport(CriterionReport):
-    """One test against an anchor.
+    """A CriterionReport of a test against an anchor.
 
     mode: `at_least`: the margin is in the gate's unit, and the outcome `not inferior` or `inferior`. `no_worse`: all
     other fields are those of an ExploiterReport, and there is no Elo.
@@ -127,11 +127,12 @@ class AnchorTest(Criterion):
         if decision.score is None:
             return None
         champion, league, conditions = contest.champion, contest.verdict.league, contest.schedule.conditions
-        blocks = contest.ledger.results(league, conditions, between=(champion, self.ref))
+        counted = contest.ledger.counted(league, conditions)
+        sums = contest.ledger.sums(league, counted, between=(champion, self.ref))
         comparison = f"{champion} has not played it"
-        if blocks:
-            points = sum(block.scores[block.contestants.index(champion)] for block in blocks)
-            comparison = f"{champion} {percent(points / sum(block.games for block in blocks))} in other games"
+        for pair, of_pair in sums.items():
+            score = of_pair.whole.points[pair.index(champion)] / of_pair.whole.played
+            comparison = f"{champion} {percent(score)} in other games"
         return f"Against {self.ref} it scored {percent(decision.score)} in {decision.games} games; {comparison}."
 
 

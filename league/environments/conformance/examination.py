@@ -84,7 +84,7 @@ def examine(
                 "fault", "has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats", agent
             )
     examination.interface = interface
-    if not examination.passed:
+    if not examination.passed or config.environment.external is not None:
         env.close()
         return examination
     examiner = Examiner(env, interface, config, examination, steps, budget)

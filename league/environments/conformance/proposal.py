@@ -51,7 +51,7 @@ class Proposal:
 
     text: str
     config: LeagueConfig
-    found: Examination
+    examination: Examination
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +63,15 @@ class _Line:
 
     def __str__(self) -> str:
         return f"{self.text:<{COMMENT_COLUMN}}  # {self.comment}" if self.comment else self.text
+
+
+GATE = (
+    _Line(),
+    _Line("gate:", "league nightly: the test for promotions"),
+    _Line("  elo1: 30", "gain in Elo that the test should detect"),
+    _Line("  max_blocks: 4000", "pairs of games after which a test ends undecided"),
+    _Line("  anchors: []", "bots or versions that a new champion must hold its own against"),
+)
 
 
 def propose(
@@ -107,7 +116,7 @@ def propose(
         *_policies(examination.interface, team),
         *_play(config, examination, examination.interface, team),
         *_training(examination, examination.interface, team),
-        *_gate(),
+        *GATE,
     ]
     text = "\n".join(map(str, lines)) + "\n"
     proposed = LeagueConfig.from_mapping(yaml.safe_load(text) | {"folder": document["folder"]}, source="the proposal")
@@ -115,28 +124,34 @@ def propose(
 
 
 def _header(config: LeagueConfig, environment: JSON, shown: str | None) -> Iterator[_Line]:
-    yield _Line("# Written by `league init`. docs/configuration.md describes all settings.")
-    yield _Line(f"league: {config.league}", "name in all commands and URLs")
+    yield from (
+        _Line("# Written by `league init`. docs/configuration.md describes all settings."),
+        _Line(f"league: {config.league}", "name in all commands and URLs"),
+    )
     if shown is not None:
         yield _Line(f"folder: {_inline(shown)}", "where the code is searched, relative to this file")
-    yield _Line()
-    yield _Line("environment:", "what is played")
-    yield _Line(f"  entry_point: {_inline(environment['entry_point'])}", "module or function that creates it")
+    entry_point = f"  entry_point: {_inline(environment['entry_point'])}"
+    yield from (
+        _Line(),
+        _Line("environment:", "what is played"),
+        _Line(entry_point, "module or function that creates it"),
+    )
     if kwargs := environment.get("kwargs"):
         yield _Line(f"  kwargs: {_inline(kwargs)}", "arguments of its constructor")
 
 
 def _policies(interface: Interface, is_team: bool) -> Iterator[_Line]:
-    yield _Line()
-    yield _Line("policies:", "policy → its agents; each policy is one network")
+    yield from (_Line(), _Line("policies:", "policy → its agents; each policy is one network"))
     for policy in interface.policy_ids:
         policy_agents = [agent for agent in interface.agents if interface.policies[agent] == policy]
         space = interface.agents[policy_agents[0]].action
         yield _Line(f"  {policy}: {_inline(_patterns(policy_agents, list(interface.agents)))}", _described(space))
     yield _Line()
     if is_team:
-        yield _Line("sides:", "side → its agents; the sides are opponents")
-        yield _Line('  team: ["*"]', "all agents are one team; without it, each is a side of its own")
+        yield from (
+            _Line("sides:", "side → its agents; the sides are opponents"),
+            _Line('  team: ["*"]', "all agents are one team; without it, each is a side of its own"),
+        )
     elif len(interface.sides) <= LISTED_AGENTS and all(map(SLUG.fullmatch, interface.sides)):
         yield _Line("sides:", "side → its agents; the sides are opponents")
         for side, agents in interface.sides.items():
@@ -145,17 +160,15 @@ def _policies(interface: Interface, is_team: bool) -> Iterator[_Line]:
         yield _Line("sides: null", "each agent is a side of its own")
 
 
-def _play(config: LeagueConfig, found: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
-    measured, reason = found.openings, "the most likely ones; sampled if information is hidden"
+def _play(config: LeagueConfig, examination: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
+    measured, reason = examination.openings, "the most likely ones; sampled if information is hidden"
     actions = "greedy" if is_team else action_selection(config, interface)
     if is_team:
         reason = "the most likely ones, as there is no opponent"
     elif actions == "sampled":
         hides = interface.hidden_information
         reason = f"drawn at random, as {'the environment hides information' if hides else 'opponents act at once'}"
-    yield _Line()
-    yield _Line("play:", "the games that are rated")
-    yield _Line(f"  actions: {actions}", reason)
+    yield from (_Line(), _Line("play:", "the games that are rated"), _Line(f"  actions: {actions}", reason))
     opening = "random moves at the start"
     if actions == "sampled":
         yield _Line("  opening_plies: 0", f"{opening}; sampled actions vary the games")
@@ -166,30 +179,33 @@ def _play(config: LeagueConfig, found: Examination, interface: Interface, is_tea
         yield _Line(f"  opening_plies: {measured.recommended}", f"{opening}; {seeds}")
 
 
-def _training(found: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
-    turns = found.actions_per_episode
-    alternatives = _other_algorithms(interface, found.api)
-    yield _Line()
-    yield _Line("training:", "league train")
-    yield _Line(
-        "  algorithm: ppo",
-        f"also possible: {', '.join(alternatives)}" if alternatives else "the only one for these spaces",
+def _training(examination: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
+    turns = examination.actions_per_episode
+    alternatives = _other_algorithms(interface, examination.api)
+    comment = f"also possible: {', '.join(alternatives)}" if alternatives else "the only one for these spaces"
+    yield from (
+        _Line(),
+        _Line("training:", "league train"),
+        _Line("  algorithm: ppo", comment),
+        _Line("  steps: 1_000_000", "budget: actions of all agents"),
+        _Line("  minutes: null", "time limit; the earlier of the two ends training"),
+        _Line("  checkpoint_every: 200_000", "actions between published versions"),
     )
-    yield _Line("  steps: 1_000_000", "budget: actions of all agents")
-    yield _Line("  minutes: null", "time limit; the earlier of the two ends training")
-    yield _Line("  checkpoint_every: 200_000", "actions between published versions")
-    yield _Line("  runners: 1", "processes that sample; 0 samples in the learner's")
     if turns is not None and turns <= SHORT_EPISODE:
         most = "1 action" if turns == 1 else f"{turns} actions"
         yield _Line("  gamma: 1.0", f"no discount: at most {most} of an agent per episode")
     else:
         yield _Line("  gamma: 0.99", "discount per action; smaller favours quick wins")
     if interface.hidden_information and not is_team:
-        yield _Line("  lr: {initial: 0.001, final: 0.0}", "learning rate, annealed as information is hidden")
-        yield _Line("  entropy: {initial: 0.1, final: 0.02}", "exploration, annealed for the same reason")
+        yield from (
+            _Line("  lr: {initial: 0.001, final: 0.0}", "learning rate, annealed as information is hidden"),
+            _Line("  entropy: {initial: 0.1, final: 0.02}", "exploration, annealed for the same reason"),
+        )
     else:
-        yield _Line("  lr: 0.0005", "learning rate of Adam")
-        yield _Line("  entropy: 0.05", "exploration; less makes the policy decide sooner")
+        yield from (
+            _Line("  lr: 0.0005", "learning rate of Adam"),
+            _Line("  entropy: 0.05", "exploration; less makes the policy decide sooner"),
+        )
     leaves = [
         leaf
         for spaces in interface.agents.values()
@@ -211,14 +227,6 @@ def _training(found: Examination, interface: Interface, is_team: bool) -> Iterat
         yield _Line("  normalize_observations: true", "the bounds of observations are wide or infinite")
     if not is_team:
         yield _Line("  opponents: []", "such as {ref: script:random, share: 0.2}; else self-play")
-
-
-def _gate() -> Iterator[_Line]:
-    yield _Line()
-    yield _Line("gate:", "league nightly: the test for promotions")
-    yield _Line("  elo1: 30", "gain in Elo that the test should detect")
-    yield _Line("  max_blocks: 4000", "pairs of games after which a test ends undecided")
-    yield _Line("  anchors: []", "bots or versions that a new champion must hold its own against")
 
 
 def _patterns(own: list[str], agents: list[str]) -> list[str]:

@@ -15,6 +15,10 @@ STRIDE = ROWS + 1
 DIRECTIONS = np.array([1, STRIDE - 1, STRIDE, STRIDE + 1], dtype=np.uint64)[:, np.newaxis]
 """Distances between neighbouring bits of a vertical line, of both diagonals and of a horizontal line, (4, 1)."""
 
+BITS = np.left_shift(np.uint64(1), np.arange(COLUMNS * STRIDE, dtype=np.uint64)).reshape(COLUMNS, STRIDE).T[:ROWS]
+BITS = BITS[..., np.newaxis]
+"""Bit of each cell, from the bottom row, (6, 7, 1)."""
+
 
 class ConnectFour(BoardGame):
     """Copies of connect four. Each player's pieces are a bitboard."""
@@ -25,23 +29,34 @@ class ConnectFour(BoardGame):
         if kwargs:
             raise UnsupportedArguments(f"connect four is not vectorised with {', '.join(kwargs)}")
         super().__init__(num_envs, (ROWS, COLUMNS), COLUMNS)
-        self._boards = np.zeros(num_envs * 2, dtype=np.uint64)
-        self._heights = np.zeros(num_envs * COLUMNS, dtype=np.int64)
+        self._boards = np.zeros((num_envs, 2), dtype=np.uint64)
+        self._heights = np.zeros((num_envs, COLUMNS), dtype=np.int64)
 
     def _place(
         self, env_ids: NDArray[np.int64], players: NDArray[np.int64], actions: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         column = env_ids * COLUMNS + actions
-        height = self._heights[column]
-        self._heights[column] = height + 1
+        heights, boards = self._heights.reshape(-1), self._boards.reshape(-1)
+        height = heights[column]
+        heights[column] = height + 1
         self._masks.reshape(-1)[column] = height < ROWS - 1
-        pieces = self._boards[players] | np.left_shift(np.uint64(1), (actions * STRIDE + height).astype(np.uint64))
-        self._boards[players] = pieces
+        pieces = boards[players] | np.left_shift(np.uint64(1), (actions * STRIDE + height).astype(np.uint64))
+        boards[players] = pieces
         return (ROWS - 1 - height) * COLUMNS + actions, has_four(pieces)
 
+    def _put(self, env_ids: NDArray[np.int64], boards: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        # (m, rows from the bottom, columns, 2)
+        boards = boards.reshape(-1, ROWS, COLUMNS, 2)[:, ::-1]
+        is_occupied = boards.any(axis=3)
+        heights = is_occupied.sum(axis=1)
+        bitboards = (boards * BITS).sum(axis=(1, 2), dtype=np.uint64)
+        self._heights[env_ids], self._masks[env_ids], self._boards[env_ids] = heights, heights < ROWS, bitboards
+        hovers = (is_occupied != (np.arange(ROWS)[:, np.newaxis] < heights[:, np.newaxis])).any(axis=(1, 2))
+        return hovers | has_four(bitboards.ravel()).reshape(-1, 2).any(axis=1)
+
     def _clear(self, env_ids: NDArray[np.int64]) -> None:
-        self._boards.reshape(-1, 2)[env_ids] = 0
-        self._heights.reshape(-1, COLUMNS)[env_ids] = 0
+        self._boards[env_ids] = 0
+        self._heights[env_ids] = 0
 
 
 def has_four(boards: NDArray[np.uint64]) -> NDArray[np.bool_]:

@@ -3,11 +3,10 @@
 from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 
-from league.environments.vector.random_actions import random_actions
-from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.spaces import ACTION_MASK, Space
+from league.environments.vector.random_actions import legal_actions
+from league.environments.vector.vector_env import VectorEnv
+from league.spaces import Space
 
 
 def steps_per_second(vector: VectorEnv, actions: list[Space], seed: int, seconds: float) -> float:
@@ -26,7 +25,7 @@ def steps_per_second(vector: VectorEnv, actions: list[Space], seed: int, seconds
     steps, duration = 0, 0.0
     rows = list(vector.reset(copies, rng.integers(2**31, size=len(copies))))
     while duration < seconds:
-        drawn = _draw(rows, actions, rng)
+        drawn = legal_actions(rows, actions, rng)
         began = perf_counter()
         rows = list(vector.step(copies, drawn))
         over = np.ones(len(copies), dtype=bool)
@@ -37,16 +36,3 @@ def steps_per_second(vector: VectorEnv, actions: list[Space], seed: int, seconds
         duration += perf_counter() - began
         steps += len(copies)
     return steps / duration
-
-
-def _draw(rows: list[AgentRows], actions: list[Space], rng: np.random.Generator) -> NDArray:
-    """Draw legal actions for all rows that must act, sorted by copy, then by agent."""
-    drawn, places = [], []
-    for block in rows:
-        acting = np.flatnonzero(~block.has_ended)
-        mask = block.observations.get(ACTION_MASK)
-        for agent in np.unique(block.agents[acting]).tolist():
-            indices = acting[block.agents[acting] == agent]
-            drawn.append(random_actions(actions[agent], len(indices), None if mask is None else mask[indices], rng))
-            places.append(block.envs[indices] * len(actions) + agent)
-    return np.concatenate(drawn)[np.argsort(np.concatenate(places), kind="stable")]

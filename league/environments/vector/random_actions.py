@@ -1,9 +1,12 @@
 """Random legal actions for many agents at once."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from league.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
+from league.environments.vector.vector_env import AgentRows
+from league.spaces import ACTION_MASK, Box, Discrete, MultiBinary, MultiDiscrete, Space
 from league.spaces.arrays import bounds
 
 AT_A_BOUND = 0.1
@@ -38,6 +41,19 @@ def random_actions(space: Space, count: int, mask: NDArray | None, rng: np.rando
             near = np.clip(rng.normal(size=drawn.shape), low, high)
             return np.where(bounded, drawn, near).astype(space.dtype)
     raise TypeError(f"random actions of a {type(space).__name__} are not supported")
+
+
+def legal_actions(rows: Sequence[AgentRows], actions: Sequence[Space], rng: np.random.Generator) -> NDArray:
+    """Draw legal actions for all rows that must act, in the order of `VectorEnv.step`. actions: space of each agent."""
+    drawn, places = [], []
+    for block in rows:
+        acting = np.flatnonzero(~block.has_ended)
+        mask = block.observations.get(ACTION_MASK)
+        for agent in np.unique(block.agents[acting]).tolist():
+            indices = acting[block.agents[acting] == agent]
+            drawn.append(random_actions(actions[agent], len(indices), None if mask is None else mask[indices], rng))
+            places.append(block.envs[indices] * len(actions) + agent)
+    return np.concatenate(drawn)[np.argsort(np.concatenate(places), kind="stable")]
 
 
 def random_choices(mask: NDArray, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -22,15 +22,21 @@ class TicTacToe(BoardGame):
         if kwargs:
             raise UnsupportedArguments(f"tic-tac-toe is not vectorised with {', '.join(kwargs)}")
         super().__init__(num_envs, (3, 3), 9)
-        self._boards = np.zeros(num_envs * 2, dtype=np.int64)
+        self._boards = np.zeros((num_envs, 2), dtype=np.int64)
 
     def _place(
         self, env_ids: NDArray[np.int64], players: NDArray[np.int64], actions: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         self._masks.reshape(-1)[env_ids * 9 + actions] = 0
-        pieces = self._boards[players] | (1 << actions)
-        self._boards[players] = pieces
+        boards = self._boards.reshape(-1)
+        pieces = boards[players] | (1 << actions)
+        boards[players] = pieces
         return actions, IS_WIN[pieces]
 
+    def _put(self, env_ids: NDArray[np.int64], boards: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        pieces = (boards << np.arange(9)[:, np.newaxis]).sum(axis=1)
+        self._boards[env_ids], self._masks[env_ids] = pieces, ~boards.any(axis=2)
+        return IS_WIN[pieces].any(axis=1)
+
     def _clear(self, env_ids: NDArray[np.int64]) -> None:
-        self._boards.reshape(-1, 2)[env_ids] = 0
+        self._boards[env_ids] = 0

@@ -109,6 +109,38 @@ class VectorEnv(ABC):
         """
         raise NotImplementedError
 
+    def copy(self, source: NDArray[np.int64], target: NDArray[np.int64]) -> None:
+        """Replace the episodes of the copies `target` by those of `source`, so that they continue identically.
+
+        The method of the base class copies the rows of all attributes that are arrays whose first axis is `num_envs`.
+        An environment that keeps its state in another way overrides it. `copying.check_copying` tests it.
+
+        Args:
+            source: Copies in the middle of an episode, (m,).
+            target: Copies, (m,), without repetitions and none of `source`.
+        """
+        for array in vars(self).values():
+            if isinstance(array, np.ndarray) and array.shape[:1] == (self.num_envs,):
+                array[target] = array.take(source, axis=0)
+
+    def restore(self, env_ids: NDArray[np.int64], observations: Mapping[str, NDArray[Any]]) -> Sequence[AgentRows]:
+        """Continue episodes from observations of the agents that must act, in games in which these show everything.
+
+        Optional: the method of the base class raises.
+
+        Args:
+            env_ids: Copies, (m,), ascending.
+            observations: As in AgentRows, one for each copy. They are not trusted.
+
+        Returns:
+            The rows of these copies. See `reset`.
+
+        Raises:
+            NotImplementedError: The environment cannot be restored from observations.
+            ObservationError: An observation is not a position of the game, or its game is over.
+        """
+        raise NotImplementedError
+
     def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32] | None:
         """Return the global states of some copies, (m, size) float32; None if the stock environment has none."""
         del env_ids

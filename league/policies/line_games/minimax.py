@@ -21,9 +21,9 @@ class BatchedMinimax:
         self._game = game
         self._bits = game.bits()
         squares = self._bits.reshape(game.rows, game.columns)
-        self._columns = np.bitwise_or.reduce(squares, axis=0)
-        self._lowest = squares[-1]
-        self._reached = self._columns if game.gravity else self._bits
+        self._board = np.bitwise_or.reduce(self._bits)
+        self._lowest = np.bitwise_or.reduce(squares[-1])
+        self._reached = np.bitwise_or.reduce(squares, axis=0) if game.gravity else self._bits
 
     def positions(self, boards: NDArray) -> tuple[Bitboards, Bitboards]:
         """Return the bitboards of boards (k, rows, columns, 2), two (k,) uint64."""
@@ -46,51 +46,60 @@ class BatchedMinimax:
         """
         values = np.full((len(own), self._game.actions), LOST, np.int8)
         winning, moves = self._completing(own), self._moves(own | other)
-        for action in range(self._game.actions):
-            move = moves & self._reached[action]
-            wins = (winning & move) != 0
-            values[wins, action] = plies
-            rows = np.flatnonzero((move != 0) & ~wins)
-            values[rows, action] = -self._value(other[rows], (own | move)[rows], plies - 1) if plies > 1 else 0
+        safe = self._safe(moves, other) & ~winning
+        for action, squares in enumerate(self._reached):
+            move = moves & squares
+            values[move != 0, action] = 1 - plies
+            values[(winning & move) != 0, action] = plies
+            rows = np.flatnonzero(safe & move)
+            values[rows, action] = -self._value(other[rows], (own | move)[rows], plies - 1)
         return values
 
     def _value(self, own: Bitboards, other: Bitboards, plies: int) -> NDArray[np.int8]:
-        """Return the values of positions, (k,): `values` of the best moves, or 0 if the board is full."""
+        """Return the values of positions, (k,), in which no move wins: `values` of the best moves; 0 without moves."""
+        if plies < 2:
+            return np.zeros(len(own), np.int8)
         moves = self._moves(own | other)
-        wins = (self._completing(own) & moves) != 0
-        value = np.where(wins, plies, 0).astype(np.int8)
-        rows = np.flatnonzero(~wins & (moves != 0))
-        if plies == 1 or not len(rows):
-            return value
-        players, opponents = own[rows], other[rows]
-        # Only a move that prevents the opponent's immediate win can be better than losing at once.
-        threats = self._completing(opponents) & moves[rows]
-        candidates = np.where(threats != 0, threats, moves[rows])
-        best = np.full(len(rows), LOST, np.int8)
+        safe = self._safe(moves, other)
+        best = np.where((safe == 0) & (moves != 0), 1 - plies, 0).astype(np.int8)
+        if plies == 2:
+            return best
+        best[safe != 0] = LOST
         for squares in self._reached:
-            move = candidates & squares
-            moving = np.flatnonzero(move)
-            replies = -self._value(opponents[moving], (players | move)[moving], plies - 1)
-            best[moving] = np.maximum(best[moving], replies)
-        value[rows] = best
-        return value
+            move = safe & squares
+            rows = np.flatnonzero(move)
+            if len(rows):
+                replies = -self._value(other[rows], (own | move)[rows], plies - 1)
+                best[rows] = np.maximum(best[rows], replies)
+        return best
 
     def _moves(self, taken: Bitboards) -> Bitboards:
         """Return the squares that can be taken: the empty ones, with gravity the lowest empty one of each column."""
-        squares = np.bitwise_or.reduce(self._bits)
-        return (taken + np.bitwise_or.reduce(self._lowest)) & squares if self._game.gravity else squares & ~taken
+        return (taken + self._lowest) & self._board if self._game.gravity else self._board & ~taken
+
+    def _safe(self, moves: Bitboards, opponents: Bitboards) -> Bitboards:
+        """Return the moves after which the opponent cannot win at once."""
+        winning = self._completing(opponents) & self._board
+        threats = moves & winning
+        # One threat must be prevented; of several, one remains.
+        safe = np.where(threats == 0, moves, threats)
+        safe[threats & (threats - np.uint64(1)) != 0] = 0
+        # With gravity, a move lets the opponent take the square above.
+        return safe & ~(winning >> np.uint64(1)) if self._game.gravity else safe
 
     def _completing(self, pieces: Bitboards) -> Bitboards:
         """Return the squares that complete a line of `pieces`, occupied ones and ones outside the board included."""
         squares = np.zeros_like(pieces)
+        everywhere = ~squares
         for step in self._game.steps():
-            for gap in range(self._game.length):
-                line = ~np.zeros_like(pieces)
-                for distance in range(self._game.length):
-                    if distance != gap:
-                        bits = (gap - distance) * step
-                        line &= pieces << np.uint64(bits) if bits >= 0 else pieces >> np.uint64(-bits)
-                squares |= line
+            # Squares with at least this number of pieces in a row on one side and on the other.
+            above, below = [everywhere], [everywhere]
+            for distance in range(1, self._game.length):
+                bits = np.uint64(distance * step)
+                above.append(above[-1] & (pieces >> bits))
+                below.append(below[-1] & (pieces << bits))
+            for count in range(self._game.length):
+                squares |= above[count] & below[-1 - count]
         return squares
 
 

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
-from sqlalchemy import ColumnElement, Select, and_, delete, exists, func, or_, select, update
+from sqlalchemy import ColumnElement, Executable, Select, and_, delete, exists, func, or_, select, update
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from league.errors import Conflict
@@ -27,6 +27,7 @@ from league.registry.publishing import VersionPublisher
 from league.registry.storage import change_counter
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
+from league.registry.storage.manifest import MIXTURE, SEARCH
 from league.registry.storage.rows import (
     AliasEvent,
     EvaluationRow,
@@ -39,12 +40,17 @@ from league.registry.storage.rows import (
 )
 from league.registry.storage.tables import (
     ABANDONED,
+    DIGEST_BYTES,
     READY,
+    STRIPE,
     AliasTable,
     Base,
+    GameDigestTable,
     IdempotentCallTable,
     MatchTable,
+    PairSumTable,
     ScheduleTable,
+    ScheduleTotalTable,
     ShadowCountTable,
     TrafficEventTable,
     VersionNoteTable,
@@ -145,8 +151,8 @@ class RemovalRepository(Repository):
         Raises:
             UnknownLeague: The league does not exist.
             UnknownVersion: The version does not exist.
-            Conflict: Something depends on it and `force` is false, it is a member of a mixture, or the league is being
-                trained or evaluated.
+            Conflict: Something depends on it and `force` is false, it is a member of a mixture, a search version plays
+                with it, or the league is being trained or evaluated.
             StorageError: A file cannot be removed. The next removal or publication removes it.
         """
         plan = self.plan_version(ref)
@@ -156,9 +162,9 @@ class RemovalRepository(Repository):
             leagues.lock(session, target.league)
             versions.require(session, target.league, target.version)
             _require_idle(session, target.league)
-            if mixtures := _mixtures_of(session, target.league, target.version):
-                names = ", ".join(f"{target.league}@{mixture}" for mixture in mixtures)
-                raise Conflict(f"{plan.target} is a member of {names}: remove the mixture first")
+            if users := _users_of(session, target.league, target.version):
+                names = ", ".join(f"{target.league}@{user}" for user in users)
+                raise Conflict(f"{plan.target} is a part of {names}: remove that first")
             dependents = _dependents_of_version(session, target.league, target.version)
             _require_free(plan.target, dependents.reasons, force)
             _delete_dependents(session, target.league, target.version, dependents, actor)
@@ -235,7 +241,7 @@ def _dependents_of_version(session: Session, league: str, number: int) -> _Depen
     dependents.reasons = [
         *(f"the alias {name} points to it" for name in dependents.aliases),
         *(f"it is the {name}" for name in dependents.portions),
-        *(f"it is a member of the mixture @{mixture}" for mixture in _mixtures_of(session, league, number)),
+        *(f"it is a part of the {role} @{user}" for user, role in _users_of(session, league, number).items()),
         *_counted(len(dependents.verdicts), "verdict", map(short_verdict, dependents.verdicts)),
         *_counted(matches, "recorded match", plural="recorded matches"),
         *(f"nightly run {night.id} tests it" for night in nights if number in night.candidates),
@@ -261,24 +267,57 @@ def _delete_dependents(session: Session, league: str, number: int, found: _Depen
         while event.beneath is not None and event.beneath in gone:
             event.beneath = events[event.beneath].beneath
     session.flush()
-    session.execute(delete(AliasEvent).where(AliasEvent.id.in_(gone)))
-    session.execute(update(AliasEvent).where(AliasEvent.verdict.in_(found.verdicts)).values(verdict=None))
-    session.execute(delete(VerdictRow).where(VerdictRow.id.in_(found.verdicts)))
-    session.execute(delete(MatchTable).where(_matches_of(f"{league}@{number}", found)))
-    session.execute(delete(ScheduleTable).where(ScheduleTable.id.in_(found.schedules)))
-    has_matches = exists().where(MatchTable.schedule == ScheduleTable.id)
-    session.execute(delete(ScheduleTable).where(ScheduleTable.id.in_(found.played), ~has_matches))
-    session.execute(delete(SnapshotRow).filter_by(league=league))
-    session.execute(delete(VersionNoteTable).filter_by(league=league, version=number))
-    strength, ref = StrengthRow, f"{league}@{number}"
-    measured = or_(strength.version == number, strength.opponent == ref)
-    session.execute(delete(strength).where(strength.league == league, measured))
-    counts = ShadowCountTable
-    of_version = or_(counts.candidate == number, counts.champion == number)
-    session.execute(delete(counts).where(counts.league == league, of_version))
-    session.execute(update(VersionTable).filter_by(league=league, parent=number).values(parent=None))
-    session.execute(update(RunRow).filter_by(league=league, parent=number).values(parent=None))
-    session.execute(update(VersionTable).filter_by(league=league, number=number).values(state=ABANDONED))
+    ref, strength, counts, schedule = f"{league}@{number}", StrengthRow, ShadowCountTable, ScheduleTable
+    sums = (ScheduleTotalTable, PairSumTable, GameDigestTable)
+    of_results: tuple[Executable, ...] = (
+        delete(AliasEvent).where(AliasEvent.id.in_(gone)),
+        update(AliasEvent).where(AliasEvent.verdict.in_(found.verdicts)).values(verdict=None),
+        delete(VerdictRow).where(VerdictRow.id.in_(found.verdicts)),
+        delete(MatchTable).where(_matches_of(ref, found)),
+        *(delete(table).where(table.schedule.in_(found.schedules)) for table in sums),
+    )
+    of_version: tuple[Executable, ...] = (
+        delete(schedule).where(schedule.id.in_(found.schedules)),
+        delete(schedule).where(schedule.id.in_(found.played), ~exists().where(MatchTable.schedule == schedule.id)),
+        delete(SnapshotRow).filter_by(league=league),
+        delete(VersionNoteTable).filter_by(league=league, version=number),
+        delete(strength).where(strength.league == league, or_(strength.version == number, strength.opponent == ref)),
+        delete(counts).where(counts.league == league, or_(counts.candidate == number, counts.champion == number)),
+        update(VersionTable).filter_by(league=league, parent=number).values(parent=None),
+        update(RunRow).filter_by(league=league, parent=number).values(parent=None),
+        update(VersionTable).filter_by(league=league, number=number).values(state=ABANDONED),
+    )
+    for statement in of_results:
+        session.execute(statement)
+    for name in found.played:
+        _delete_sums(session, name, ref)
+    for statement in of_version:
+        session.execute(statement)
+
+
+def _delete_sums(session: Session, schedule: str, ref: str) -> None:
+    """Delete the sums over the deleted matches of a version in a schedule, which is deleted if it has no others."""
+    pair, match, total = PairSumTable, MatchTable, ScheduleTotalTable
+    of_version = or_(pair.first == ref, pair.second == ref)
+    session.execute(delete(pair).where(pair.schedule == schedule, of_version))
+    recorded = select(match.position, func.length(match.moves)).where(match.schedule == schedule)
+    sizes: dict[int, int] = dict(session.execute(recorded).tuples().all())
+    for row in session.scalars(select(GameDigestTable).filter_by(schedule=schedule)):
+        begin = STRIPE * row.stripe
+        positions = [position for position in range(begin, begin + STRIPE) if position in sizes]
+        if not positions:
+            session.delete(row)
+            continue
+        kept = bytearray(DIGEST_BYTES * (positions[-1] + 1 - begin))
+        for start in (DIGEST_BYTES * (position - begin) for position in positions):
+            kept[start : start + DIGEST_BYTES] = row.digests[start : start + DIGEST_BYTES]
+        row.digests = bytes(kept)
+    session.flush()
+    row_of_total = session.get_one(total, schedule)
+    row_of_total.matches, row_of_total.size = len(sizes), sum(sizes.values())
+    if not sizes:
+        session.delete(row_of_total)
+    session.flush()
 
 
 def _matches_of(ref: str, found: _Dependents) -> ColumnElement[bool]:
@@ -296,10 +335,14 @@ def _require_idle(session: Session, league: str) -> None:
         raise Conflict(f"evaluation {evaluation.id} of league {league} is {evaluation.state}: stop it, or wait")
 
 
-def _mixtures_of(session: Session, league: str, number: int) -> list[int]:
-    numbers = session.scalars(select(VersionTable.number).filter_by(league=league, state=READY)).all()
-    mixtures = versions.mixtures(session, league, numbers)
-    return sorted(mixture_number for mixture_number, mixture in mixtures.items() if number in mixture.versions)
+def _users_of(session: Session, league: str, number: int) -> dict[int, str]:
+    """Return the mixtures and search versions that a version plays for, with their roles, ascending."""
+    users = _ready(league).where(VersionTable.role.in_((MIXTURE, SEARCH)))
+    return {
+        user.number: user.role
+        for user in session.scalars(users)
+        if number in versions.members(session, league, [user.number])
+    }
 
 
 def _require_free(target: str, reasons: Sequence[str], force: bool) -> None:

@@ -4,7 +4,7 @@ The training state of a version is by far its largest part, and only needed to c
 for the versions that an alias points to, for the newest ones, and for young ones. All files of a version are removed if
 moreover no alias ever pointed to it, no canary, shadow, verdict or recorded game refers to it, and its league is not
 being trained, since any version may be an opponent. Its row stays: the version is *retired*, and its number is never
-reused. What refers to a mixture refers to its members.
+reused. What refers to a mixture refers to its members. The version that a search version plays with keeps its files.
 
 Versions are marked before their files are removed. An interrupted removal is completed by the next one.
 """
@@ -23,7 +23,7 @@ from league.registry import leagues, traffic, versions
 from league.registry.storage import change_counter
 from league.registry.storage.artifacts import ArtifactStore
 from league.registry.storage.database import Database, Repository
-from league.registry.storage.manifest import MIXTURE
+from league.registry.storage.manifest import MIXTURE, SEARCH
 from league.registry.storage.rows import AliasEvent, NightlyRunRow, VerdictRow
 from league.registry.storage.tables import READY, AliasTable, ScheduleTable, VersionTable
 from league.registry.training import runs
@@ -105,11 +105,12 @@ def _candidates(session: Session, league: str, keep: int, before: datetime) -> t
     old = {version.number for version in ready[keep:] if version.reserved_at < before}
     aliased = set(session.scalars(select(AliasTable.version).filter_by(league=league)))
     old -= aliased | versions.members(session, league, aliased)
-    needed = _needed(session, league)
+    # Mixtures and search versions have no files but their manifests.
+    searching = set(session.scalars(select(table.number).filter_by(league=league, role=SEARCH)))
+    needed = _needed(session, league) | searching
     needed |= versions.members(session, league, needed)
     if runs.is_trained(session, league):
         needed |= old  # any version may be an opponent
-    # A mixture has no files but its manifest.
     needed |= set(session.scalars(select(table.number).filter_by(league=league, role=MIXTURE)))
     gone = session.scalars(select(table.number).where(table.league == league, table.retired_at.is_not(None)))
     return (old - needed) | set(gone), old & needed

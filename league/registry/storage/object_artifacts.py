@@ -3,13 +3,16 @@
 <url>/<league>/<number>/manifest.json, <policy>.onnx, training/…
 
 Files are uploaded first and the manifest last. A version is visible once its row in the registry is ready. Files are
-verified by the digests in that row, so other objects in the store have no influence.
+verified by the digests in that row, so other objects in the store have no influence. Those that are read are cached on
+the local disk by their SHA-256. Several processes may share a cache.
 """
 
 import hashlib
+import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -17,8 +20,65 @@ from typing import Any
 from league.errors import ConfigError, StorageError, one_line
 from league.files import check_digest, digests_of, disk_errors, files_in
 from league.registry.storage.artifacts import ArtifactStore, files_missing, label
-from league.registry.storage.digest_cache import DigestCache
 from league.registry.storage.manifest import MANIFEST, TRAINING, Manifest
+
+CACHE_LIMIT = 4 * 10**9
+"""Bytes. The files that were not used for the longest time are removed beyond it."""
+
+
+class DigestCache:
+    """A directory of files that are named by their digest. limit: size of all files, in bytes."""
+
+    def __init__(self, directory: Path, limit: int = CACHE_LIMIT) -> None:
+        self._directory = directory
+        self._limit = limit
+
+    def read(self, sha256: str, fetch: Callable[[], bytes | None]) -> bytes | None:
+        """Return the content with this digest, from the cache or else from `fetch`.
+
+        A cached file that was damaged is fetched again. Content of `fetch` with another digest is returned, but not
+        cached. None: `fetch` found nothing.
+        """
+        path = self._directory / sha256
+        with suppress(OSError):
+            content = path.read_bytes()
+            if hashlib.sha256(content).hexdigest() == sha256:
+                os.utime(path)
+                return content
+        fetched = fetch()
+        if fetched is not None and hashlib.sha256(fetched).hexdigest() == sha256:
+            self._write(path, fetched)
+        return fetched
+
+    def _write(self, path: Path, content: bytes) -> None:
+        with disk_errors(path):
+            self._directory.mkdir(parents=True, exist_ok=True)
+            # Other processes may write the same file.
+            descriptor, draft = tempfile.mkstemp(dir=self._directory, prefix=".part-")
+            try:
+                with os.fdopen(descriptor, "wb") as file:
+                    file.write(content)
+                Path(draft).replace(path)
+            except BaseException:
+                Path(draft).unlink(missing_ok=True)
+                raise
+        self._evict(path)
+
+    def _evict(self, newest: Path) -> None:
+        entries = []
+        for path in self._directory.iterdir():
+            with suppress(FileNotFoundError):
+                state = path.stat()
+                entries.append((state.st_mtime_ns, state.st_size, path))
+        excess = sum(size for _, size, _ in entries) - self._limit
+        for _, size, path in sorted(entries):
+            if excess <= 0:
+                return
+            if path != newest:
+                with suppress(OSError):
+                    path.unlink()
+                excess -= size
+
 
 REMOVED = "training.removed"
 """Object of a version whose training state is being removed, or was removed."""

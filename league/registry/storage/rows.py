@@ -17,8 +17,7 @@ from league.errors import LeagueArchived
 from league.histograms import Histogram
 from league.interface import Interface
 from league.refs import short_verdict
-from league.registry.storage.manifest import Manifest, Role, trained_role
-from league.registry.storage.mixture import Mixture
+from league.registry.storage.manifest import Manifest, Mixture, Role, SearchSettings, trained_role
 from league.registry.storage.tables import Base
 
 if TYPE_CHECKING:
@@ -148,6 +147,11 @@ class VersionRow:
         return self.manifest.mixture
 
     @property
+    def search(self) -> SearchSettings | None:
+        """The search of a search version; None for other versions."""
+        return self.manifest.search
+
+    @property
     def steps(self) -> int:
         return self.manifest.steps
 
@@ -225,14 +229,12 @@ class ServedState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledgement(ServedState):
-    """What a replica has reported that it serves of a league."""
+    """What a replica has reported that it serves of a league. Times as in RegisteredReplica."""
 
     replica: str
     league: str
     seen_at: datetime
-    """Time of its last report, by the clock of the database."""
     silence: timedelta
-    """Time since its last report, by the clock of the database."""
 
 
 class VersionState(NamedTuple):
@@ -529,7 +531,7 @@ class RunRow(Record, kw_only=True):
 
     league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), primary_key=True)
     id: Mapped[str] = mapped_column(String(64), primary_key=True)
-    algorithm: Mapped[str] = mapped_column(String(32))
+    algorithm: Mapped[str] = mapped_column(String(32).with_variant(Text(), "postgresql"))
     settings: Mapped[dict[str, Any]]
     seed: Mapped[int] = mapped_column(BigInteger)
     target: Mapped[int | None] = mapped_column(BigInteger)

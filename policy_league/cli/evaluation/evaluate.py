@@ -125,16 +125,6 @@ def _show(report: "EvaluationReport", registry: "Registry") -> None:
     for side, leaderboard in report.by_side.items():
         say(f"\nAs {side}:")
         show_leaderboard(leaderboard)
-    _show_payoff(report)
-    for ref, lost in report.forfeits.items():
-        complain(f"{ref} forfeited {lost}")
-    if report.population is not None:
-        say("\nα-Rank and Nash equilibrium shares [95 %]:")
-        shares = map(_share, report.population.alpha_rank), map(_share, report.population.nash)
-        table(("contestant", "α-Rank", "Nash"), zip(report.payoff.contestants, *shares, strict=True))
-
-
-def _show_payoff(report: "EvaluationReport") -> None:
     payoff = report.payoff
     say(f"\nVersions played with {report.actions} actions.")
     compared = "" if report.scoring == "game" else ", compared on the same side and seed"
@@ -144,6 +134,12 @@ def _show_payoff(report: "EvaluationReport") -> None:
         say("\nMean return of the row minus mean return of the column in the same blocks [95 %]:")
         gaps = [[None if gap is None else str(gap) for gap in row] for row in payoff.difference]
         _show_matrix(payoff.contestants, gaps)
+    for ref, lost in report.forfeits.items():
+        complain(f"{ref} forfeited {lost}")
+    if report.population is not None:
+        say("\nα-Rank and Nash equilibrium shares [95 %]:")
+        shares = map(_share, report.population.alpha_rank), map(_share, report.population.nash)
+        table(("contestant", "α-Rank", "Nash"), zip(payoff.contestants, *shares, strict=True))
 
 
 def _show_matrix(contestants: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:

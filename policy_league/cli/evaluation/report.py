@@ -55,8 +55,7 @@ def write_report(registry: "Registry", league: str, out: Path) -> dict[str, Any]
 
     Raises UnknownLeague or StorageError.
     """
-    from policy_league.cli.evaluation.report_contents import league_report
-    from policy_league.cli.evaluation.report_file import report_file
+    from policy_league.cli.evaluation.report_contents import league_report, report_file
 
     contents = league_report(registry, league)
     with disk_errors(out, action="written"), replacing(out) as part:

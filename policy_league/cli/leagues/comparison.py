@@ -32,17 +32,29 @@ def compare(
         _show(comparison)
 
 
-def _show(found: "RunComparison") -> None:
-    first, second = found.runs
+def _show(comparison: "RunComparison") -> None:
+    runs = first, second = comparison.runs
     columns = ("", "first", "second")
-    table(columns, _summary(found), prose=columns[1:])
-    if found.settings:
+    summary = {
+        "run": [run.run for run in runs],
+        "league": [run.league for run in runs],
+        "algorithm": [run.algorithm for run in runs],
+        "state": [run.state for run in runs],
+        "from": [run.parent or "scratch" for run in runs],
+        "began": [f"{run.began_at.astimezone():%Y-%m-%d %H:%M}" for run in runs],
+        "actions": [f"{run.steps:,}" for run in runs],
+        "minutes": [f"{run.seconds / 60:.1f}" for run in runs],
+        "actions/s": [_number(run.actions_per_second) for run in runs],
+        "versions": [", ".join(ref.partition("@")[2] for ref in run.versions) or "none" for run in runs],
+    }
+    table(columns, [(name, *values) for name, values in summary.items()], prose=columns[1:])
+    if comparison.settings:
         say("\nSettings that differ:")
-        table(columns, [(name, *map(_value, pair)) for name, pair in found.settings.items()], prose=columns[1:])
-    if found.curves:
+        table(columns, [(name, *map(_value, pair)) for name, pair in comparison.settings.items()], prose=columns[1:])
+    if comparison.curves:
         say("\nLast values of the curves:")
-        table(columns, [(name, *map(_number, pair)) for name, pair in found.curves.items()])
-    if (between := found.between) is not None:
+        table(columns, [(name, *map(_number, pair)) for name, pair in comparison.curves.items()])
+    if (between := comparison.between) is not None:
         low, high = between.interval
         say(
             f"\n{between.first} against {between.second}: score {between.score:.3f} [{low:.3f}, {high:.3f}] in"
@@ -51,22 +63,6 @@ def _show(found: "RunComparison") -> None:
     elif first.league == second.league and first.versions and second.versions:
         versions = f"{first.versions[-1]} {second.versions[-1]}"
         say(f"\nThe last versions have not played each other: league evaluate {first.league} {versions}")
-
-
-def _summary(found: "RunComparison") -> list[tuple[str, ...]]:
-    rows = {
-        "run": [run.run for run in found.runs],
-        "league": [run.league for run in found.runs],
-        "algorithm": [run.algorithm for run in found.runs],
-        "state": [run.state for run in found.runs],
-        "from": [run.parent or "scratch" for run in found.runs],
-        "began": [f"{run.began_at.astimezone():%Y-%m-%d %H:%M}" for run in found.runs],
-        "actions": [f"{run.steps:,}" for run in found.runs],
-        "minutes": [f"{run.seconds / 60:.1f}" for run in found.runs],
-        "actions/s": [_number(run.actions_per_second) for run in found.runs],
-        "versions": [", ".join(ref.partition("@")[2] for ref in run.versions) or "none" for run in found.runs],
-    }
-    return [(name, *values) for name, values in rows.items()]
 
 
 def _value(value: Any) -> str:

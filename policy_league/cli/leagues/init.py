@@ -75,9 +75,8 @@ def init(
         )
     with disk_errors(path, action="written"), replacing(path) as part:
         part.write_text(proposal.text, encoding="utf-8")
-    examination = proposal.found
-    say(examination.policies)
-    say(examination.actions)
+    examination = proposal.examination
+    say(f"{examination.policies}\n{examination.actions}")
     if examination.views and len(proposal.config.sides or ()) != 1:
         say(examination.views)
     if proposal.config.play.actions == "greedy" and examination.openings is not None:

@@ -1,16 +1,14 @@
 """`league remove`."""
 
-import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from league.errors import InvalidInput
 from league.refs import CheckpointRef, check_slug
 from policy_league.cli.options import AsJson, open_registry
-from policy_league.cli.output import counted, emit, say
+from policy_league.cli.output import confirm, counted, emit, say
 
 if TYPE_CHECKING:
     from league.registry.deletion.removal import RemovalPlan
@@ -45,7 +43,8 @@ def remove(
             say(sentence)
     if not dry_run:
         if force or not plan.reasons:
-            _confirm(plan, yes)
+            hint = "without a terminal, confirm with --yes, or use --dry-run"
+            confirm(f"Remove {plan.target}? This cannot be undone.", hint, yes=yes)
         with registry.exclusive_lock(f"nightly-{league}"):
             if ref is not None:
                 plan = removal.remove_version(CheckpointRef.parse(plan.target), force=force)
@@ -68,11 +67,3 @@ def _sentences(plan: "RemovalPlan") -> Iterator[str]:
             yield f"  {what}: {count:,}"
     if plan.reasons:
         yield f"In use: {'; '.join(plan.reasons)}."
-
-
-def _confirm(plan: "RemovalPlan", yes: bool) -> None:
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise InvalidInput("without a terminal, confirm with --yes, or use --dry-run")
-    typer.confirm(f"Remove {plan.target}? This cannot be undone.", abort=True)

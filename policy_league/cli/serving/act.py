@@ -1,6 +1,8 @@
 """`league act`."""
 
 import sys
+import time
+from dataclasses import asdict
 from pathlib import Path
 from secrets import token_hex
 from typing import Annotated, Any
@@ -8,7 +10,7 @@ from typing import Annotated, Any
 import orjson
 import typer
 
-from league.errors import ConfigError, InvalidReference, RemoteError
+from league.errors import ConfigError, InvalidInput, InvalidReference, RemoteError
 from league.refs import CHAMPION, CheckpointRef, PolicyRef, RemoteRef, ScriptRef, parse_ref
 from policy_league.cli.options import DEFAULT_URL, MAX_SEED, open_registry
 from policy_league.cli.output import emit, say
@@ -35,6 +37,13 @@ def act(
         typer.Option("--explore/--greedy", help="Sample an action, or take the greedy one. Default: as in matches."),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, max=MAX_SEED, help="Random seed for a sampled action.")] = None,
+    deadline_ms: Annotated[
+        int | None,
+        typer.Option(
+            min=1, metavar="MS", help="A search version plays the best action after this time. Default: none."
+        ),
+    ] = None,
+    analysis: Annotated[bool, typer.Option("--analysis", help="Print what a search version expects, as JSON.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the complete response as JSON.")] = False,
 ) -> None:
     """Request one action from a policy server, or compute it locally."""
@@ -53,16 +62,15 @@ def act(
         value = first_observation(league.config, league.interface, policy)
     else:
         value = _read(observation)
-    response = (_act_here if local else _ask)(parsed, policy, value, explore, seed, url)
-    if as_json:
+    options = {"explore": explore, "seed": seed, "deadline_ms": deadline_ms, "analysis": analysis}
+    response = _act_here(parsed, policy, value, options) if local else _ask(parsed, policy, value, options, url)
+    if as_json or analysis:
         emit(response)
     else:
         say(str(response["action"]))
 
 
-def _ask(
-    ref: CheckpointRef, policy: str | None, value: Any, explore: bool | None, seed: int | None, url: str
-) -> dict[str, Any]:
+def _ask(ref: CheckpointRef, policy: str | None, value: Any, options: dict[str, Any], url: str) -> dict[str, Any]:
     import httpx
     import numpy as np
 
@@ -71,46 +79,65 @@ def _ask(
     model = str(PolicyRef(ref.league, policy))
     try:
         with Client(url) as client:
-            response = client.act(f"{model}@{ref.version}", value, explore=explore, seed=seed)
+            response = client.act(f"{model}@{ref.version}", value, **options)
     except RemoteError as error:
         if not isinstance(error.__cause__, httpx.ConnectError):
             raise
         raise RemoteError(
             f"{error}; `league serve` starts a server, --url names another, --local needs none"
         ) from error
-    return {
+    document = {
         "action": np.asarray(response.action).tolist(),
         "model": model,
         "version": response.version,
         "sha256": response.sha256,
     }
+    if response.simulations is not None:
+        document["simulations"] = response.simulations
+    if response.analysis is not None:
+        document["analysis"] = asdict(response.analysis)
+    return document
 
 
-def _act_here(
-    ref: CheckpointRef, policy: str | None, value: Any, explore: bool | None, seed: int | None, _: str
-) -> dict[str, Any]:
+def _act_here(ref: CheckpointRef, policy: str | None, value: Any, options: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
 
-    from league.policies.loading import acting_version, load
+    from league.policies.loading import acting_version, policy_id
     from league.random.seeds import generator
-    from serve_app.codecs.observation_codec import ObservationReader, reject_strings
+    from league.search.policies import SearchPolicy, contestant
+    from league.search.searched_actions import MOVES, SearchedActions
+    from league.spaces.observation_codec import ObservationReader, reject_strings
 
     registry = open_registry()
     version = acting_version(registry.versions.resolve(ref), registry, token_hex())
-    loaded = load(version.ref, policy=policy, registry=registry)
-    space = version.manifest.policies[policy or next(iter(version.manifest.policies))].observation
+    league = registry.leagues.get(ref.league)
+    name, interface = policy_id(version, policy), version.manifest.interface
+    players = contestant(version.ref, registry, interface, league.config.environment)
+    player = dict(players.values())[name]
+    limits: dict[str, Any] = {}
+    if isinstance(player, SearchPolicy):
+        if options["deadline_ms"] is not None:
+            limits["deadline"] = time.monotonic() + options["deadline_ms"] / 1000
+        limits["moves"] = MOVES if options["analysis"] else 0
+    elif options["analysis"]:
+        raise InvalidInput(f"--analysis: {version.ref} does not search")
     reject_strings(value)
-    observations = ObservationReader(space).read([value])
+    observations = ObservationReader(interface.of_policy(name).observation).read([value])
     # The same generator as on the server, so that both sample the same action.
-    rng = np.random.default_rng() if seed is None else generator(seed, 0)
-    is_sampled = registry.leagues.get(ref.league).conditions.actions == "sampled" if explore is None else explore
-    actions = loaded.act(observations, explore=is_sampled, rng=[rng])
-    return {
+    rng = [np.random.default_rng() if options["seed"] is None else generator(options["seed"], 0)]
+    is_sampled = league.conditions.actions == "sampled" if options["explore"] is None else options["explore"]
+    actions = player.act(observations, explore=is_sampled, rng=rng, **limits)
+    document = {
         "action": actions.actions[0].tolist(),
         "model": str(PolicyRef(ref.league, policy)),
         "version": version.number,
         "sha256": version.sha256,
     }
+    if isinstance(actions, SearchedActions):
+        document["simulations"] = actions.simulations()[0]
+        if options["analysis"]:
+            document["analysis"] = actions.analyses()[0]
+    return document
 
 
 def _read(observation: str) -> Any:

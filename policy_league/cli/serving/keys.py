@@ -60,8 +60,10 @@ def create(
         emit(_document(key) | {"key": token})
         return
     say(token)
-    say(f"\nStore the key {name} now: it is not shown again. Clients send `Authorization: Bearer {token[:12]}_…`.")
-    say("From now on, servers require a key for every request, unless deploy.yaml sets require_keys to never.")
+    say(
+        f"\nStore the key {name} now: it is not shown again. Clients send `Authorization: Bearer {token[:12]}_…`.\n"
+        "From now on, servers require a key for every request, unless deploy.yaml sets require_keys to never."
+    )
 
 
 @app.command("list")

@@ -21,7 +21,7 @@ def replicas(
     removed by the others on its machine or in its Ray cluster after 15 seconds, or else after a day. One that is silent
     but has not ended may still serve an old version.
     """
-    from league.registry.replicas import LIVENESS_TIMEOUT
+    from league.registry.replicas import LIVENESS_TIMEOUT, URL
 
     repository = open_registry().replicas
     registrations = {registration.replica: registration for registration in repository.registered()}
@@ -42,6 +42,7 @@ def replicas(
                         "seen_at": registration.seen_at,
                         "silent_seconds": registration.silence.total_seconds(),
                         "silent": registration.silence >= LIVENESS_TIMEOUT,
+                        "url": registration.process.get(URL),
                     }
                     for registration in registrations.values()
                 ]
@@ -53,7 +54,8 @@ def replicas(
             registration.replica,
             registration.seen_at,
             "silent" if registration.silence >= LIVENESS_TIMEOUT else "reports",
+            registration.process.get(URL, ""),
         )
         for registration in registrations.values()
     ]
-    table(("replica", "last report", "state"), rows)
+    table(("replica", "last report", "state", "URL on its machine"), rows)

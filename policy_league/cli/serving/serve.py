@@ -33,6 +33,9 @@ def serve(
     address: Annotated[
         str | None, typer.Option(help="Running Ray cluster. Default: start Ray on this machine.")
     ] = None,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Start the local Ray's dashboard, with Ray's own metrics.")
+    ] = False,
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Accept requests without an API key, even from other machines.")
     ] = False,
@@ -60,10 +63,12 @@ def serve(
         insecure=insecure,
         root_path=root_path,
         address=address,
-        on_ready=lambda url, logs: say(
+        dashboard=dashboard,
+        on_ready=lambda url, logs, of_dashboard: say(
             f"Serving the leagues of {storage.home} on {url}\n{hints(open_registry(), url)}\n"
             f"Logs of Ray and of the replicas: {logs}\n"
-            "Stop: Ctrl-C"
+            + (f"Ray's dashboard: {of_dashboard}\n" if of_dashboard else "")
+            + "Stop: Ctrl-C"
         ),
     )
 

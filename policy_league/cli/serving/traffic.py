@@ -139,8 +139,7 @@ def _show(registry: "Registry", league: str, as_json: bool) -> None:
 
 
 def _document(one: "ShadowCounts") -> dict[str, Any]:
-    document = asdict(one)
-    del document["latency"], document["ns"], document["league"]
+    document = {name: value for name, value in asdict(one).items() if name not in ("latency", "ns", "league")}
     quantiles = {"p50": one.milliseconds(0.5), "p95": one.milliseconds(0.95)}
     return document | {"agreement": one.agreement, "latency_ms": quantiles}
 

@@ -57,15 +57,13 @@ def _show(league: "LeagueConfig", found: "Examination") -> None:
             f"{league.environment.entry_point}: {found.api}, {counted(found.agents, 'agent')}, {state}, episodes of"
             f" {_lengths(found)}, {found.steps_per_second:,.{found.steps_per_second < 10:d}f} steps per second"
         )
-        say(found.implementation)
-        say(found.policies)
-        say(found.actions)
-        if found.views:
-            say(found.views)
+        say("\n".join(filter(None, (found.implementation, found.policies, found.actions, found.views))))
         if (openings := found.openings) is not None:
             say(str(openings))
             if (plies := league.play.opening_plies) != openings.recommended and 0 < plies <= len(openings.lengths):
                 say(f"play.opening_plies is {plies}. {openings.effect(plies)}.")
+    elif league.environment.external is not None:
+        say("\n".join((found.policies, found.actions, "What simulators report is checked when they play.")))
     if (vectorised := found.vectorised) is not None:
         ratio = vectorised.steps_per_second / vectorised.stock_steps_per_second
         say(

@@ -1,6 +1,7 @@
 """Options that `league train` and `league sweep` share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import wraps
 from inspect import Parameter, signature
@@ -8,11 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from policy_league.cli.output import say
 from policy_league.configs.bundled import find
 
 if TYPE_CHECKING:
     from league.config.league import LeagueConfig
     from league.ray_cluster import LocalRay
+    from league.settings import Storage
+
+PRELOADED = "training.runs.preloaded"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +58,17 @@ class TrainingOptions:
         """The limits of a Ray that is started."""
         from league.ray_cluster import LocalRay
 
-        return LocalRay(self.cpus, self.object_store, self.dashboard)
+        return LocalRay(self.cpus, self.object_store, self.dashboard, preload=PRELOADED)
+
+    @contextmanager
+    def connected(self, storage: "Storage") -> Iterator[None]:
+        """Connect to Ray, before this process imports PyTorch: the workers of a local Ray do so at the same time."""
+        from league.ray_cluster import connected
+
+        with connected(self.address, storage, self.local) as dashboard:
+            if dashboard is not None:
+                say(f"Ray's dashboard: {dashboard}")
+            yield
 
 
 def with_training_options(command: Callable[..., None]) -> Callable[..., None]:

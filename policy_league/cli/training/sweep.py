@@ -22,29 +22,31 @@ def sweep(
     resume: Annotated[bool, typer.Option("--resume", help="Resume an interrupted sweep.")] = False,
     publish: Annotated[bool, typer.Option(help="Publish the last checkpoint of the best trial as a version.")] = True,
     samples: Annotated[
-        int | None, typer.Option(min=1, help="Number of samples of the random parameters. Overrides CONFIG.")
+        int | None,
+        typer.Option(
+            min=1, help="Number of samples of the random parameters; of trials, with Optuna. Overrides CONFIG."
+        ),
     ] = None,
 ) -> None:
     """Train with each combination of settings and report the best.
 
-    Runs one trial per combination of the values in CONFIG's `sweep` section. Prints all trials, and the settings of the
-    best one as YAML. TensorBoard logs are written to LEAGUE_HOME/sweeps. `league sweep CONFIG --resume` continues after
-    an interruption.
+    Runs one trial per combination of the values in CONFIG's `sweep` section, or those that Optuna chooses. Prints all
+    trials, and the settings of the best one as YAML. TensorBoard logs are written to LEAGUE_HOME/sweeps. `league sweep
+    CONFIG --resume` continues after an interruption.
     """
-    from evaluation.service.strength_process import StrengthProcess
-    from training.sweeps.sweep import sweep as run
-
     league = options.league(config)
     if samples is not None and league.sweep is not None:
         league = league.model_copy(update={"sweep": league.sweep.model_copy(update={"samples": samples})})
-    with exit_on_interrupt():
+    registry = open_registry()
+    with exit_on_interrupt(), options.connected(registry.storage):
+        from evaluation.service.strength_process import StrengthProcess
+        from training.sweeps.sweep import sweep as run
+
         report = run(
             league,
-            registry=open_registry(),
+            registry=registry,
             resume=resume,
             publish_best=publish,
-            address=options.address,
-            local=options.local,
             config_path=find(config),
             console=console,
             open_games=StrengthProcess,

@@ -3,6 +3,7 @@
 import os
 import shlex
 from contextlib import closing
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,6 +19,7 @@ from policy_league.configs.bundled import find
 
 if TYPE_CHECKING:
     from league.config.league import LeagueConfig
+    from league.registry.registry import Registry
     from league.registry.storage.rows import VersionRow
 
 TOKENS = {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
@@ -38,6 +40,10 @@ Job = Annotated[
 RoleName = Annotated[
     Literal["main", "exploiter"], typer.Option("--role", help="`exploiter`: a run against one version only.")
 ]
+Like = Annotated[
+    str | None,
+    typer.Option(metavar="REF", help="Use as many runners, environments, threads and GPUs as this version's run."),
+]
 Against = Annotated[
     str | None,
     typer.Option(metavar="REF", help="The opponent of an exploiter in all episodes, such as connect_four@champion."),
@@ -52,6 +58,7 @@ def train(
     parent: Parent = None,
     role: RoleName = "main",
     against: Against = None,
+    like: Like = None,
     resume: Resume = False,
     job: Job = False,
 ) -> None:
@@ -65,33 +72,39 @@ def train(
     training.exploiter apply, and the published versions cannot become champion. `--resume --role exploiter` continues
     the newest exploiter's run.
 
+    The cores and GPUs determine how many runners, environments and threads a run uses, unless CONFIG does. All of them
+    affect what is learned: --like repeats a run on another machine.
+
     A job continues when this command exits. Custom environments must be installed on the cluster.
 
     Next step: `league nightly CONFIG` finds the strongest version and promotes it.
     """
     league = options.league(config)
     if job:
-        run_options = without_none(**{"from": parent, "role": None if role == "main" else role}, against=against)
+        run_options = without_none(
+            **{"from": parent, "role": None if role == "main" else role}, against=against, like=like
+        )
         _submit(find(config), run_options, resume, options)
         return
-    from evaluation.service.strength_process import StrengthProcess
-    from training.runs.train import train as run
-
     registry = open_registry()
-    with exit_on_interrupt(), closing(StrengthProcess(registry.storage)) as measure:
-        published = run(
-            league,
-            registry=registry,
-            parent=_version(parent, league),
-            role=role,
-            target=_version(against, league),
-            resume=resume,
-            address=options.address,
-            local=options.local,
-            config_path=find(config),
-            console=console,
-            measure=measure,
-        )
+    with exit_on_interrupt(), options.connected(registry.storage):
+        from evaluation.service.strength_process import StrengthProcess
+        from training.runs.train import train as run
+
+        if like is not None:
+            league = league.with_training(**_resources_of(registry, like, league) | options.settings)
+        with closing(StrengthProcess(registry.storage)) as measure:
+            published = run(
+                league,
+                registry=registry,
+                parent=_version(parent, league),
+                role=role,
+                target=_version(against, league),
+                resume=resume,
+                config_path=find(config),
+                console=console,
+                measure=measure,
+            )
     if published:
         say(f"\nPublished {', '.join(version.ref for version in published)}.")
         say(f"Next: {next_step(config, published[-1])}")
@@ -120,6 +133,17 @@ def _submit(config: Path, run_options: dict[str, object], resume: bool, options:
     arguments = [f"--{name}={value}" for name, value in (run_options | options.settings).items()]
     with exit_on_interrupt():
         submit(options.address, config, arguments + ["--resume"] * resume, Storage.from_environment(), say)
+
+
+def _resources_of(registry: "Registry", ref: str, league: "LeagueConfig") -> dict[str, object]:
+    """Return the settings of a version's training that depend on the machine."""
+    from training.algorithms.resources import Resources
+
+    version = registry.versions.resolve(CheckpointRef.parse(of_league(ref, league.league)))
+    settings = version.manifest.settings
+    if not (recorded := {field.name: settings[field.name] for field in fields(Resources) if field.name in settings}):
+        raise ConfigError(f"--like: {version.ref} was not trained by `league train`")
+    return recorded
 
 
 def _version(ref: str | None, league: "LeagueConfig") -> CheckpointRef | None:

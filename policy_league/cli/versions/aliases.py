@@ -19,7 +19,7 @@ from league.refs import (
     short_verdict,
 )
 from policy_league.cli.options import Actor, AsJson, LeagueName, Reason, Timeout, open_registry
-from policy_league.cli.output import counted, emit, say, table
+from policy_league.cli.output import confirm, counted, emit, say, table
 
 if TYPE_CHECKING:
     from league.registry.registry import Registry
@@ -79,7 +79,7 @@ def promote(
         actor=actor or getpass.getuser(),
         reason=reason,
     )
-    _moved(event, current, as_json, _followers(registry, event, timeout) if wait else None)
+    _moved(event, current, as_json, registry.changes.wait_for_alias(event, timeout) if wait else None)
 
 
 def _confirm(registry: "Registry", version: "VersionRow", as_json: bool) -> None:
@@ -132,6 +132,7 @@ def mixture(
     from league.policies.loading import eligible
     from league.results.ledger import Ledger
     from league.results.payoffs import METHODS, meta_strategy
+    from league.results.sums import outcomes, whole
 
     if method not in METHODS:
         raise InvalidInput(f"--method {method!r}: expected {' or '.join(METHODS)}")
@@ -139,12 +140,12 @@ def mixture(
         check_alias(alias)
     registry = open_registry()
     conditions = registry.leagues.get(check_slug("league", league)).conditions
-    refs = [row.ref for row in eligible(registry, league)]
-    equilibrium = meta_strategy(refs, Ledger(registry).results(league, conditions), method)
-    probable = (
-        (ref, share) for ref, share in zip(equilibrium.refs, equilibrium.probabilities, strict=True) if share > 0
-    )
-    kept = {ref: share for ref, share in probable if share >= at_least}
+    refs = [row.ref for row in eligible(registry, league) if row.search is None]
+    ledger = Ledger(registry)
+    sums = ledger.sums(league, ledger.counted(league, conditions))
+    equilibrium = meta_strategy(refs, outcomes(whole(sums)), method)
+    probabilities = zip(equilibrium.refs, equilibrium.probabilities, strict=True)
+    kept = {ref: share for ref, share in probabilities if share > 0 and share >= at_least}
     if not kept:
         highest = max(equilibrium.probabilities, default=0.0)
         raise InvalidInput(
@@ -155,20 +156,11 @@ def mixture(
         _show(equilibrium, shares)
     if alias is None:
         if as_json:
-            emit(
-                {
-                    "league": league,
-                    "method": method,
-                    "games": equilibrium.games,
-                    "unmet": equilibrium.unmet,
-                    "members": shares,
-                }
-            )
+            figures = {"games": equilibrium.games, "unmet": equilibrium.unmet}
+            emit({"league": league, "method": method} | figures | {"members": shares})
         return
-    if not yes:
-        if as_json or not sys.stdin.isatty():
-            raise InvalidInput("without a terminal, confirm with --yes, or omit --alias to show the mixture only")
-        typer.confirm(f"Point {league}@{alias} to it?", abort=True)
+    hint = "without a terminal, confirm with --yes, or omit --alias to show the mixture only"
+    confirm(f"Point {league}@{alias} to it?", hint, yes=yes, as_json=as_json)
     ref = next(iter(shares)) if len(shares) == 1 else ",".join(f"{ref}:{share!r}" for ref, share in shares.items())
     promote(ref, alias=alias, yes=True, reason=reason, actor=actor, wait=wait, timeout=timeout, as_json=as_json)
 
@@ -221,11 +213,7 @@ def rollback(
         actor=actor or getpass.getuser(),
         reason=reason,
     )
-    _moved(event, event.previous, as_json, _followers(registry, event, timeout) if wait else None)
-
-
-def _followers(registry: "Registry", event: "AliasEvent", timeout: float) -> list[str]:
-    return registry.changes.wait_for_alias(event, timeout)
+    _moved(event, event.previous, as_json, registry.changes.wait_for_alias(event, timeout) if wait else None)
 
 
 def _moved(event: "AliasEvent", previous: int | None, as_json: bool, replicas: list[str] | None) -> None:
@@ -278,7 +266,7 @@ def history(
                 event.previous,
                 event.actor,
                 event.reason,
-                _short(event.verdict),
+                event.verdict and short_verdict(event.verdict),
             )
             for event in events
         ],
@@ -287,10 +275,4 @@ def history(
 
 
 def _document(event: "AliasEvent") -> dict[str, object]:
-    document = asdict(event)
-    del document["beneath"]
-    return document
-
-
-def _short(verdict: str | None) -> str | None:
-    return None if verdict is None else short_verdict(verdict)
+    return {name: value for name, value in asdict(event).items() if name != "beneath"}

@@ -61,6 +61,8 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
 def _role(row: "VersionRow") -> str | None:
     if row.mixture is not None:
         return f"{row.role} of {row.mixture}"
+    if row.search is not None:
+        return f"{row.role} with {row.search}"
     return None if row.exploits is None else f"{row.role} of @{CheckpointRef.parse(row.exploits).version}"
 
 
@@ -89,6 +91,7 @@ def _document(row: "VersionRow", standing: dict[str, Any]) -> dict[str, Any]:
         "role": row.role,
         "exploits": row.exploits,
         "members": row.mixture and [member.model_dump() for member in row.mixture.members],
+        "search": row.search and row.search.model_dump(),
         "sha256": row.sha256,
         "created_at": row.created_at,
         "retired_at": row.retired_at,

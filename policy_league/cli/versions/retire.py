@@ -1,16 +1,14 @@
 """`league retire`: removes the files of old versions, and old access logs."""
 
-import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from league.errors import InvalidInput
 from league.refs import check_slug
 from policy_league.cli.options import AsJson, open_registry
-from policy_league.cli.output import emit, say, table
+from policy_league.cli.output import confirm, emit, say, table
 
 if TYPE_CHECKING:
     from league.registry.deletion.retention import Removal
@@ -46,7 +44,9 @@ def retire(
     old_logs = former_logs(registry.storage.home / logs, replicas, before)
     is_empty = not old_logs and not any(plan.versions or plan.training for plan in plans)
     if not dry_run and not is_empty:
-        _confirm(sum(plan.size for plan in plans) + sum(path.stat().st_size for path in old_logs), yes)
+        size = sum(plan.size for plan in plans) + sum(path.stat().st_size for path in old_logs)
+        hint = "without a terminal, confirm with --yes, or use --dry-run"
+        confirm(f"Remove {size / MEGABYTE:,.0f} MB?", hint, yes=yes)
         plans = [registry.retention.retire(name, keep=keep, before=before) for name in names]
         for path in old_logs:
             path.unlink(missing_ok=True)
@@ -86,14 +86,6 @@ def former_logs(directory: Path, replicas: set[str], before: datetime) -> list[P
         if path.name.removeprefix("access-").partition(".jsonl")[0] not in replicas
         and path.stat().st_mtime < before.timestamp()
     )
-
-
-def _confirm(size: int, yes: bool) -> None:
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        raise InvalidInput("without a terminal, confirm with --yes, or use --dry-run")
-    typer.confirm(f"Remove {size / MEGABYTE:,.0f} MB?", abort=True)
 
 
 def _document(plan: "Removal") -> dict[str, Any]:

@@ -5,7 +5,7 @@ import re
 from base64 import b64decode
 from html.parser import HTMLParser
 
-from policy_league.cli.evaluation.report_file import report_file
+from policy_league.cli.evaluation.report_contents import report_file
 from serve_app.routes.pages import FILES
 
 HOSTILE = "</script><script>alert('mine')</script><!-- <script> <img src=x onerror=alert(1)> \u2028 '\"&"

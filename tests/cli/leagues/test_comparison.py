@@ -50,6 +50,14 @@ def test_runs_are_compared_by_short_ids(league: League, monkeypatch: pytest.Monk
     assert [run["run"] for run in document["runs"]] == list(RUNS)
 
 
+def test_versions_that_have_not_played_each_other_are_named(
+    league: League, registry: Registry, runs: tuple[str, str]
+) -> None:
+    first, second = (tictactoe.publish(registry, tictactoe.graph(), source=f"{run}/checkpoint").ref for run in runs)
+    out = " ".join(league("compare", *runs).out.split())
+    assert f"have not played each other: league evaluate tictactoe {first} {second}" in out
+
+
 @pytest.mark.usefixtures("runs")
 def test_unknown_and_ambiguous_runs_are_usage_errors(league: League) -> None:
     for name, message in (

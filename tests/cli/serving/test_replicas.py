@@ -4,6 +4,7 @@ import pytest
 from sqlalchemy import update
 
 from league.registry.registry import Registry
+from league.registry.replicas import URL
 from league.registry.storage.database import clock
 from league.registry.storage.tables import ReplicaTable
 from tests.support.command import League
@@ -15,8 +16,8 @@ pytestmark = on_both_databases
 @pytest.fixture
 def silent(registry: Registry) -> str:
     """A replica that reports, and one that has not done so for an hour."""
-    for replica in ("alive", "silent"):
-        registry.replicas.register(replica, {})
+    registry.replicas.register("alive", {URL: "http://127.0.0.1:30001"})
+    registry.replicas.register("silent", {})
     with registry.database.write() as session:
         seen_at = clock(session) - timedelta(hours=1)
         session.execute(update(ReplicaTable).filter_by(replica="silent").values(seen_at=seen_at))
@@ -30,6 +31,8 @@ def test_replicas_are_listed_with_their_state(league: League) -> None:
     assert [line.split()[0] for line in out.splitlines() if "silent" in line] == ["silent"]
     document = league("replicas", "--json").json
     assert [(each["replica"], each["silent"]) for each in document["replicas"]] == [("alive", False), ("silent", True)]
+    assert [each["url"] for each in document["replicas"]] == ["http://127.0.0.1:30001", None]
+    assert "http://127.0.0.1:30001" in out
     assert document["replicas"][1]["silent_seconds"] == pytest.approx(3600, abs=60)
 
 

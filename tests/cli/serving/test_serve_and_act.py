@@ -1,12 +1,17 @@
 import json
 from contextlib import closing
+from functools import partial
 from pathlib import Path
+
+import pytest
 
 from league.registry.registry import Registry
 from league.settings import Storage
 from policy_league.cli.serving.serve import hints
+from policy_league_client import Client
 from tests.support.command import League
 from tests.support.leagues import tictactoe
+from tests.support.policies.graphs import masked_mlp
 
 EMPTY = {"observation": [[[0, 0]] * 3] * 3, "action_mask": [1] * 9}
 
@@ -33,11 +38,26 @@ def test_act_locally_on_text_a_file_and_stdin(league: League, registry: Registry
         assert document["sha256"] == registry.versions.get("tictactoe", 3).sha256
 
 
-def test_a_server_that_does_not_answer(league: League, registry: Registry) -> None:
+def test_a_server_that_does_not_answer(league: League, registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("policy_league_client.Client", partial(Client, retry_deadline=0.5))
     result = league("act", "tictactoe@3", "--url", "http://127.0.0.1:9", "-o", json.dumps(EMPTY))
-    assert result.code == 1
+    assert (result.code, result.err.count("\n")) == (1, 1)
     assert "http://127.0.0.1:9/v1/policies/tictactoe/action?version=3 cannot be reached: " in result.err
     assert "`league serve` starts a server, --url names another, --local needs none" in result.err
+
+
+def test_a_search_version_acts_locally_and_explains_itself(league: League, registry: Registry) -> None:
+    value = masked_mlp((3, 3, 2), 9, has_value=True)
+    base = tictactoe.publish(registry, masked_mlp((3, 3, 2), 9), value=value)
+    version = league("search", base.ref, "--simulations", "300", "--json").json["version"]
+    ref, position = f"tictactoe@{version}", ("-o", json.dumps(EMPTY))
+    document = league("act", ref, "--local", *position, "--analysis").json
+    assert document["simulations"] == sum(document["analysis"]["visits"]) == 300
+    assert document["action"] == document["analysis"]["line"][0]
+    assert league("act", ref, "--local", *position, "--deadline-ms", "60000").out.strip() == str(document["action"])
+    assert league("act", ref, "--local", *position, "--deadline-ms", "1", "--json").json["simulations"] < 300
+    refused = league("act", base.ref, "--local", *position, "--analysis")
+    assert (refused.code, refused.err) == (2, f"league: --analysis: {base.ref} does not search\n")
 
 
 def test_exploration_with_a_seed_is_reproducible(league: League, registry: Registry) -> None:

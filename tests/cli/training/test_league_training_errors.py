@@ -29,7 +29,7 @@ training: {steps: 64, opponents: {league: {}}}
             "league tictactoe has no alias 'champion'; known: none yet",
         ),
         ("exploitability tictactoe@2", "tictactoe@2 has no exploiters: train one with"),
-        ("mixture empty", "the league has 0 versions, expected at least two: `league train CONFIG` publishes them"),
+        ("mixture empty", "expected at least two versions, the league has 0: `league train CONFIG` publishes them"),
     ],
 )
 def test_it_is_one_line_and_nothing_is_lost(

@@ -105,6 +105,20 @@ def test_ctrl_c_publishes_the_current_checkpoint_and_a_second_one_exits_at_once(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
+def test_a_run_repeats_the_resources_of_a_version(league: League, config: Path) -> None:
+    document = yaml.safe_load(config.read_text())
+    document["training"] |= {"runners": "auto", "steps": 256}
+    config.write_text(yaml.safe_dump(document))
+    for arguments in (["--runners=0"], ["--like=@1"]):
+        result = league("train", str(config), *arguments)
+        assert result.code == 0, result.err
+        assert "2 cores: 4 environments in the learner's process, a learner of 2 threads." in result.out
+    result = league("train", str(config), "--like=@1", "--runners=1")
+    assert "2 cores: 1 runner of 4 environments, a learner of 2 threads." in result.out
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
 def test_a_sweep_prints_its_trials_and_the_best_settings(league: League, config: Path, home: Path) -> None:
     result = league("sweep", str(config), "--steps=256", "--runners=0")
     assert result.code == 0, result.err

@@ -43,7 +43,7 @@ def test_replicas_are_waited_for(league: League, registry: Registry) -> None:
         ("tictactoe@1:x,tictactoe@2:0.4", "'x' is not a probability: expected tictactoe@1:PROBABILITY"),
         ("tictactoe@1:0.5,tictactoe@1:0.5", "tictactoe@1 is twice in the mixture"),
         ("tictactoe@1:1", "a mixture has 1 version, expected at least two"),
-        ("tictactoe@mixed:0.5,@1:0.5", "tictactoe@4 is a mixture (@1 50.0 %, @2 50.0 %): the members of a mixture"),
+        ("tictactoe@mixed:0.5,@1:0.5", "tictactoe@4 is a mixture (@1 50.0 %, @2 50.0 %): name one of its members"),
     ],
 )
 def test_an_invalid_mixture_changes_nothing(league: League, registry: Registry, ref: str, message: str) -> None:

@@ -6,6 +6,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import AlreadyRunning, ConfigError
 from league.histograms import BOUNDS
+from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import ShadowCounts
 from league.registry.verdicts import VerdictRepository
@@ -32,13 +35,15 @@ from policy_league.cli.output import verdict as verdict_line
 from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, STRONGEST, WEAK, league_of
-from tests.support.templates import copy_of
+from tests.support.policies.graphs import masked_mlp
 
 
-@pytest.fixture(autouse=True)
-def few_rating_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def few_rating_matches() -> Iterator[None]:
     """Otherwise half of a run's games are for ratings."""
-    monkeypatch.setattr("evaluation.gating.nightly.RATING_BLOCKS", 6)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("evaluation.gating.nightly.RATING_BLOCKS", 6)
+        yield
 
 
 @pytest.fixture
@@ -48,18 +53,27 @@ def registry(tmp_path: Path) -> Iterator[Registry]:
     opened.close()
 
 
+@dataclass(frozen=True)
+class FirstRun:
+    """A nightly run that has ended: the home of its league, its report and what its listener was told."""
+
+    home: Path
+    report: NightlyReport
+    events: list[Progress | VerdictReport]
+
+
+@pytest.fixture(scope="module")
+def first_run(tmp_path_factory: pytest.TempPathFactory) -> FirstRun:
+    home, events = tmp_path_factory.mktemp("judged"), list[Progress | VerdictReport]()
+    with closing(league_of(home, WEAK, MIDDLING, STRONG, MIDDLING)) as registry:
+        return FirstRun(home, nightly(CONFIG, registry=registry, listener=events.append), events)
+
+
 @pytest.fixture
-def judged(tmp_path: Path) -> Iterator[Registry]:
+def judged(first_run: FirstRun, tmp_path: Path) -> Iterator[Registry]:
     """The same league after its first nightly run."""
-    opened = copy_of(run_once, Storage.at(tmp_path / "judged"))
-    yield opened
-    opened.close()
-
-
-def run_once(storage: Storage) -> Registry:
-    registry = league_of(storage.home, WEAK, MIDDLING, STRONG, MIDDLING)
-    nightly(CONFIG, registry=registry)
-    return registry
+    with closing(_copy(first_run.home, tmp_path / "judged")) as opened:
+        yield opened
 
 
 def state(registry: Registry) -> dict[str, Any]:
@@ -76,9 +90,8 @@ def outcomes(report: NightlyReport) -> list[tuple[str, str, str, bool]]:
     return [(v.candidate, v.opponent, v.outcome, v.promoted) for v in report.verdicts]
 
 
-def test_a_nightly_run_promotes_the_strongest_version(registry: Registry) -> None:
-    events: list[Progress | VerdictReport] = []
-    report = nightly(CONFIG, registry=registry, listener=events.append)
+def test_a_nightly_run_promotes_the_strongest_version(first_run: FirstRun, judged: Registry) -> None:
+    report, events = first_run.report, first_run.events
     assert outcomes(report) == [
         ("tictactoe@1", "script:random", "reject", False),
         ("tictactoe@2", "script:random", "promote", True),
@@ -86,7 +99,7 @@ def test_a_nightly_run_promotes_the_strongest_version(registry: Registry) -> Non
         ("tictactoe@4", "tictactoe@3", "reject", False),
     ]
     assert (report.champion_before, report.champion, report.faults) == (None, "tictactoe@3", ())
-    assert registry.aliases.current(tictactoe.LEAGUE) == {"champion": 3}
+    assert judged.aliases.current(tictactoe.LEAGUE) == {"champion": 3}
     assert [standing.ref for standing in report.leaderboard][:2] == ["script:one_ply", "tictactoe@3"]
     assert all(standing.rating is not None for standing in report.leaderboard)
     assert [each for each in events if isinstance(each, VerdictReport)] == list(report.verdicts)
@@ -150,11 +163,9 @@ def test_an_identical_policy_is_not_promoted(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
-def test_the_number_of_workers_does_not_change_the_result(tmp_path: Path) -> None:
-    local, distributed = (league_of(tmp_path / name, WEAK, MIDDLING, STRONG) for name in ("alone", "many"))
-    nightly(CONFIG, registry=local)
-    nightly(CONFIG, registry=distributed, workers=2)
-    assert state(local) == state(distributed)
+def test_the_number_of_workers_does_not_change_the_result(registry: Registry, judged: Registry) -> None:
+    nightly(CONFIG, registry=registry, workers=2)
+    assert state(registry) == state(judged)
 
 
 @pytest.mark.parametrize("every", [15, pytest.param(1, marks=pytest.mark.slow)])
@@ -163,7 +174,7 @@ def test_a_run_that_died_after_any_transaction_continues(
 ) -> None:
     """After a crash at each single transaction, the final state equals that of an uninterrupted run."""
     gate = {"elo1": 150, "max_blocks": 100, "nights": 2, "alpha": 0.2, "anchors": ["script:random"], "margin": 150}
-    config = tictactoe.config(gate=gate, play={"opening_plies": 2, "num_envs": 4})
+    config = tictactoe.config(gate=gate, play={"opening_plies": 2, "num_envs": 16})
     league_of(tmp_path / "fresh", MIDDLING, STRONG, config=config).close()
     quiet = _copy(tmp_path / "fresh", tmp_path / "quiet")
     with crash_after(0, monkeypatch) as count:
@@ -179,6 +190,49 @@ def test_a_run_that_died_after_any_transaction_continues(
         assert state(registry) == expected, f"after transaction {crash_at}"
         assert report.champion == "tictactoe@2"
         registry.close()
+
+
+def test_candidates_are_tested_with_the_search_of_the_champion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also after a crash at transactions of the nightly run."""
+
+    def tested(registry: Registry) -> object:
+        """The number of the search version that is published for the test may differ, and hence seeds of its games."""
+        content = state(registry)
+        rows = registry.verdicts.all(tictactoe.LEAGUE)
+        searches = [registry.versions.get(row.league, row.candidate).search for row in rows]
+        candidates = [search and (search.version, search.rule, search.simulations) for search in searches]
+        return candidates, [row.outcome for row in rows], len(content["matches"]), content["nights"]
+
+    gate = {"max_blocks": 4, "nights": 2, "confirmation_blocks": 0}
+    config = tictactoe.config(gate=gate, play={"opening_plies": 2, "num_envs": 16})
+    with closing(league_of(tmp_path / "fresh", config=config)) as fresh:
+        value = masked_mlp((3, 3, 2), 9, has_value=True)
+        tictactoe.publish(fresh, masked_mlp((3, 3, 2), 9), value=value)
+        fresh.publisher.publish_search(tictactoe.LEAGUE, 1, "gumbel", 4, 1.0)
+        fresh.aliases.set(tictactoe.LEAGUE, "champion", 2, expected=ANY, actor="test", reason="test")
+        tictactoe.publish(fresh, masked_mlp((3, 3, 2), 9, seed=1), value=value)
+        fresh.publisher.publish_search(tictactoe.LEAGUE, 3, "puct", 4, 1.0)
+        tictactoe.publish(fresh, MIDDLING)  # without a value
+    quiet = _copy(tmp_path / "fresh", tmp_path / "quiet")
+    with crash_after(0, monkeypatch) as count:
+        report = nightly(config, registry=quiet)
+    assert [verdict.candidate for verdict in report.verdicts] == ["tictactoe@6", "tictactoe@4", "tictactoe@5"]
+    assert str(quiet.versions.get(tictactoe.LEAGUE, 6).search).startswith("@3, 4 simulations, gumbel, ")
+    assert report.faults == ()
+    assert [night.candidates for night in quiet.nightly_runs.all(tictactoe.LEAGUE)] == [(3, 4, 5)]
+    assert nightly(config, registry=quiet).verdicts == ()
+    expected = tested(quiet)
+    with closing(_copy(tmp_path / "quiet", tmp_path / "plain")) as plain:
+        plain.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=ANY, actor="test", reason="test")
+        nightly(config, registry=plain)
+        candidates = {row.candidate for row in plain.verdicts.all(tictactoe.LEAGUE)}
+    assert 3 not in candidates, "it was tested with the search of the former champion"
+    for crash_at in range(count[0], 0, -6):
+        with closing(_copy(tmp_path / "fresh", tmp_path / str(crash_at))) as registry:
+            with crash_after(crash_at, monkeypatch), pytest.raises(ProcessDeath):
+                nightly(config, registry=registry)
+            nightly(config, registry=registry)
+            assert tested(registry) == expected, f"after transaction {crash_at}"
 
 
 def _copy(home: Path, to: Path) -> Registry:
@@ -199,23 +253,21 @@ verdicts = 0
 def listener(progress):
     global verdicts
     verdicts += isinstance(progress, VerdictReport)
-    if verdicts == 2 and not isinstance(progress, VerdictReport) and progress.played:
+    if verdicts == 1 and not isinstance(progress, VerdictReport) and progress.played:
         os.kill(os.getpid(), signal.SIGKILL)
 nightly(CONFIG, registry=Registry.open(Storage.at(sys.argv[1])), listener=listener)
 """
 
 
 @pytest.mark.slow
-def test_a_killed_run_continues(registry: Registry, tmp_path: Path) -> None:
+def test_a_killed_run_continues(registry: Registry, judged: Registry) -> None:
     command = [sys.executable, "-c", KILLED, str(registry.storage.home)]
     killed = subprocess.run(command, cwd=Path(__file__).parents[3], timeout=120, check=False)
     assert killed.returncode == -signal.SIGKILL
-    assert [verdict.outcome for verdict in registry.verdicts.all(tictactoe.LEAGUE)] == ["reject", "promote", None]
+    assert [verdict.outcome for verdict in registry.verdicts.all(tictactoe.LEAGUE)] == ["reject", None]
     report = nightly(CONFIG, registry=registry)
-    assert [verdict.candidate for verdict in report.verdicts] == ["tictactoe@3", "tictactoe@4"]
-    quiet = league_of(tmp_path / "quiet", WEAK, MIDDLING, STRONG, MIDDLING)
-    nightly(CONFIG, registry=quiet)
-    assert state(registry) == state(quiet)
+    assert [verdict.candidate for verdict in report.verdicts] == ["tictactoe@2", "tictactoe@3", "tictactoe@4"]
+    assert state(registry) == state(judged)
 
 
 def test_a_concurrent_run_is_rejected(judged: Registry) -> None:
@@ -341,7 +393,7 @@ def test_hypotheses_out_of_range_are_rejected() -> None:
 
 def test_a_candidate_without_the_required_shadow_traffic_is_not_tested(tmp_path: Path) -> None:
     gate = {"shadow_agreement": 0.5, "latency_ms": 10, "shadow_observations": 10}
-    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 2}, gate=gate)
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate=gate)
     registry = league_of(tmp_path / "home", MIDDLING, STRONG, STRONGEST, config=config)
     registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="test", reason="test")
     latency = (0, 100, *[0] * (len(BOUNDS) - 1))
@@ -359,7 +411,7 @@ def test_a_candidate_without_the_required_shadow_traffic_is_not_tested(tmp_path:
 
 def test_members_of_a_champion_are_shadowed_in_its_place(tmp_path: Path) -> None:
     gate = {"shadow_agreement": 0.5, "shadow_observations": 150}
-    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 2}, gate=gate)
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate=gate)
     registry = league_of(tmp_path / "home", MIDDLING, MIDDLING, STRONGEST, config=config)
     mixture = registry.publisher.publish_mixture(tictactoe.LEAGUE, {1: 0.5, 2: 0.5}).number
     registry.aliases.set(tictactoe.LEAGUE, "champion", mixture, expected=None, actor="test", reason="test")
@@ -373,7 +425,7 @@ def test_members_of_a_champion_are_shadowed_in_its_place(tmp_path: Path) -> None
 
 def test_the_latency_limit_applies_to_the_slowest_requests(tmp_path: Path) -> None:
     """Nine of ten observations took 50 µs, the others up to 250 ms: the median is within the limit, the tail is not."""
-    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 2}, gate={"latency_ms": 10})
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate={"latency_ms": 10})
     registry = league_of(tmp_path / "home", MIDDLING, STRONG, config=config)
     registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="test", reason="test")
     latency = [0] * (len(BOUNDS) + 1)
@@ -387,14 +439,14 @@ def test_the_latency_limit_applies_to_the_slowest_requests(tmp_path: Path) -> No
 
 
 def test_shadow_traffic_is_not_required_without_a_champion(tmp_path: Path) -> None:
-    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 2}, gate={"shadow_agreement": 1.0})
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate={"shadow_agreement": 1.0})
     registry = league_of(tmp_path / "home", STRONG, config=config)
     assert outcomes(nightly(config, registry=registry)) == [("tictactoe@1", "script:random", "promote", True)]
     registry.close()
 
 
 def with_yearly_alpha(**gate: Any) -> LeagueConfig:
-    return tictactoe.config(play={"opening_plies": 2, "num_envs": 4}, gate={"nights": 365, "max_blocks": 1000} | gate)
+    return tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate={"nights": 365, "max_blocks": 1000} | gate)
 
 
 def test_the_alpha_of_a_night_is_divided_among_its_candidates(tmp_path: Path) -> None:
@@ -470,21 +522,20 @@ def test_a_verdict_voided_during_its_test_spends_its_alpha(tmp_path: Path) -> No
 def test_purged_games_are_kept_but_ignored(judged: Registry) -> None:
     first = judged.verdicts.all(tictactoe.LEAGUE)[1]
     assert first.evidence is not None
-    number = len(Ledger(judged).results(tictactoe.LEAGUE))
+    league = judged.leagues.get(tictactoe.LEAGUE)
+    number = CountedGames(judged, league).matches
     verdicts.void(judged, first.id, actor="me", reason="a broken machine", purge=True)
     row = judged.verdicts.get(first.id)
     assert row.outcome == "void"
     own = [row.schedule, row.confirmation, *(test["schedule"] for test in row.tests)]
     played = sum(len(Ledger(judged).positions(schedule)) for schedule in own)
-    assert len(Ledger(judged).results(tictactoe.LEAGUE)) == number - played
+    assert CountedGames(judged, league).matches == number - played
     assert len(Ledger(judged).matches(league=tictactoe.LEAGUE, schedule=row.schedule)) >= first.evidence["blocks"]
     assert verify(first.id, registry=judged).outcome == "void"
-    counted = CountedGames(judged, judged.leagues.get(tictactoe.LEAGUE))
-    assert counted.games == sum(result.games for result in Ledger(judged).results(tictactoe.LEAGUE))
 
 
-def test_a_promotion_is_confirmed_by_new_games_of_fixed_number(registry: Registry) -> None:
-    report = nightly(CONFIG, registry=registry)
+def test_a_promotion_is_confirmed_by_new_games_of_fixed_number(first_run: FirstRun, judged: Registry) -> None:
+    report = first_run.report
     promoted = [verdict for verdict in report.verdicts if verdict.promoted]
     assert [gain.verdict for gain in report.confirmations] == [verdict.verdict for verdict in promoted]
     for gain, verdict in zip(report.confirmations, promoted, strict=True):
@@ -493,11 +544,11 @@ def test_a_promotion_is_confirmed_by_new_games_of_fixed_number(registry: Registr
         assert low is not None
         assert high is not None
         assert low < gain.elo < high
-        row = registry.verdicts.get(verdict.verdict)
-        fresh = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.confirmation)
-        counted = Ledger(registry).matches(league=tictactoe.LEAGUE, schedule=row.schedule)
+        row = judged.verdicts.get(verdict.verdict)
+        fresh = Ledger(judged).matches(league=tictactoe.LEAGUE, schedule=row.confirmation)
+        counted = Ledger(judged).matches(league=tictactoe.LEAGUE, schedule=row.schedule)
         assert {match.seed for match in fresh}.isdisjoint(match.seed for match in counted)
-    assert nightly(CONFIG, registry=registry).confirmations == ()
+    assert nightly(CONFIG, registry=judged).confirmations == ()
 
 
 def test_returns_are_tested_by_betting_if_configured(tmp_path: Path) -> None:

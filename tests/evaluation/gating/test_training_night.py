@@ -20,9 +20,10 @@ from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues import tictactoe
 from tests.support.leagues.handwritten_training import HandwrittenTrainer
 from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEAK, league_of
+from tests.support.policies.graphs import masked_mlp
 
 GATE = {"elo1": 150, "max_blocks": 100, "confirmation_blocks": 4, "exploiters": {"blocks": 4}}
-CONFIG = tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 4})
+CONFIG = tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 16})
 LEAGUE = tictactoe.LEAGUE
 
 
@@ -145,7 +146,7 @@ def test_a_champion_that_changes_during_training_is_the_opponent_of_the_gate(reg
 def test_an_algorithm_without_opponents_trains_no_exploiter(registry: Registry) -> None:
     announced: list[str] = []
     night, _ = training_night(
-        tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 4}, training={"algorithm": "maddpg"}),
+        tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 16}, training={"algorithm": "maddpg"}),
         registry=registry,
         train=(trainer := trainer_of(registry, STRONG)),
         announce=announced.append,
@@ -187,6 +188,17 @@ def test_a_night_continues_the_likeliest_member_and_tests_against_the_mixture(re
     }
     played = [match for match in Ledger(registry).matches(league=LEAGUE) if "tictactoe@3" in match.contestants]
     assert {member for match in played for game in match.games for member in game.members} == {1, 2, None}
+
+
+def test_a_night_continues_the_version_that_a_champion_searches_with(registry: Registry) -> None:
+    value = masked_mlp((3, 3, 2), 9, has_value=True)
+    base = tictactoe.publish(registry, masked_mlp((3, 3, 2), 9), value=value)
+    number = registry.publisher.publish_search(LEAGUE, base.number, "puct", 8, 1.0).number
+    registry.aliases.set(LEAGUE, "champion", number, expected=ANY, actor="me", reason="test")
+    trainer = HandwrittenTrainer(registry, lambda *_: WEAK)
+    night, _ = training_night(CONFIG, registry=registry, train=trainer)
+    assert (night.parent, trainer.calls[0][1], night.start) == (number, base.number, base.number)
+    assert [verdict["opponent"] for verdict in night.steps["gate"]["verdicts"]] == [f"tictactoe@{number}"]
 
 
 def test_the_trainer_decides_where_a_night_starts(registry: Registry) -> None:

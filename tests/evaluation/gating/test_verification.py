@@ -131,8 +131,8 @@ def test_a_missing_match_is_detected(registry: Registry) -> None:
         verify(row.id, registry=registry)
 
 
-def test_a_modified_game_is_detected_by_replay(registry: Registry) -> None:
-    """Consistent returns and scores are accepted until the game is replayed."""
+def test_a_modified_game_is_detected_by_the_sums_and_by_replay(registry: Registry) -> None:
+    """With the sums changed as well, consistent returns and scores are accepted until the game is replayed."""
     row = verdicts(registry)[0]
 
     def change(moves: list[Any]) -> None:
@@ -140,6 +140,10 @@ def test_a_modified_game_is_detected_by_replay(registry: Registry) -> None:
             game[1] = game[1][:-1]
 
     change_moves(registry, row.id, change)
+    with pytest.raises(VerdictRefuted, match=r"the sums of schedule .* contradict its games: .*game_digests of 0"):
+        verify(row.id, registry=registry)
+    ledger = Ledger(registry)
+    ledger.recount(ledger.schedule(row.schedule))
     verify(row.id, registry=registry)
     with pytest.raises(VerdictRefuted, match="cannot be replayed"):
         verify(row.id, registry=registry, replays=2)

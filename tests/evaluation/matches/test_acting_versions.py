@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evaluation.matches.acting_versions import acting_versions
 from evaluation.matches.game_loop import play_matches
+from evaluation.matches.seating import acting_versions
 from evaluation.matches.tournament import evaluate, play_schedule
 from evaluation.playback.replay import live_game, recorded_game
 from evaluation.schedules.builders import game_plans, round_robin
@@ -20,7 +20,7 @@ from league.errors import InvalidInput
 from league.policies.loading import contestant
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
-from league.registry.storage.mixture import Member, Mixture
+from league.registry.storage.manifest import Member, Mixture
 from league.results.ledger import Ledger
 from league.results.records import Game, dump_games, load_games
 from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, build_roster

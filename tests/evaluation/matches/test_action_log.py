@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.matches.action_log import ActionLog
+from evaluation.matches.match_recorder import ActionLog
 
 
 @given(st.permutations(range(4)), st.integers(1, 5), st.integers(0, 7))

@@ -54,7 +54,7 @@ def test_exported_networks_compute_each_row_alone(tmp_path: Path, training: obje
     """Their outputs for a row are equal in every batch, to the last bit, and so are the games."""
     import torch
 
-    from training.algorithms.ppo import module_spec
+    from training.algorithms.rllib_config import module_spec
     from training.export.onnx_export import export_policy
 
     graphs = []

@@ -25,6 +25,7 @@ from league.policies.policy import Actions, Arrays, Policy
 from league.results.ledger import Ledger
 from league.results.records import Forfeit, Game, Match, Reason, Schedule, dump_games, load_games
 from league.results.scoring import admit
+from league.results.sums import tally, whole
 from tests.support.environments.kinds import KINDS, Kind
 from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, build_roster
 from tests.support.leagues import tictactoe
@@ -373,12 +374,12 @@ def test_a_forfeited_game_has_no_return() -> None:
     assert all(match.games[0].returns[0] > match.games[1].returns[1] for match in matches)
     assert {match.mean_return(0) for match in matches} == {match.result().returns for match in matches} == {None}
     assert paired_difference(matches, "kind@a") is None
-    table = {standing.ref: standing for standing in rank_contestants(match.result() for match in matches)}
+    table = {standing.ref: standing for standing in rank_contestants(whole(tally(matches)))}
     assert (table["kind@a"].mean_return, table["kind@a"].score, table["kind@a"].games) == (None, 0.0, len(matches))
-    _, whole = play_pair(SOLO, NEVER, NEVER)
-    assert {forfeit_difference(match, "kind@a") for match in whole} == {None}
-    mixed = rank_contestants(match.result() for match in [*matches, *whole])
-    assert mixed[0].mean_return == pytest.approx(np.mean([match.mean_return(0) for match in whole]))
+    _, complete = play_pair(SOLO, NEVER, NEVER)
+    assert {forfeit_difference(match, "kind@a") for match in complete} == {None}
+    mixed = rank_contestants(whole(tally([*matches, *complete])))
+    assert mixed[0].mean_return == pytest.approx(np.mean([match.mean_return(0) for match in complete]))
 
 
 @pytest.mark.parametrize("crashes", [False, True], ids=["illegal", "crashes"])
@@ -395,7 +396,7 @@ def test_a_tournament_continues_with_a_version_that_forfeits(tmp_path: Path, cra
     assert (lost.games, lost.reasons) == (forfeits(matches, "tictactoe@2"), {reasons.pop(): lost.games})
     assert compute_leaderboard(registry, tictactoe.LEAGUE)[-1].ref == "tictactoe@2"
     match, index = next((m, i) for m in matches for i, game in enumerate(m.games) if game.forfeits)
-    leaderboard = rank_contestants(match.result() for match in matches)
+    leaderboard = rank_contestants(whole(tally(matches)))
     assert {standing.ref: standing.mean_return for standing in leaderboard}["tictactoe@1"] is not None
     note = recorded_game(match.id, index, registry).note
     assert note is not None

@@ -1,8 +1,10 @@
 from dataclasses import replace
 from itertools import permutations
 
-from evaluation.matches.game_records import UpsetFinder
+from evaluation.matches import game_records
+from evaluation.matches.game_records import Upset
 from league.results.records import Game, Match
+from league.results.sums import examples, game_digest
 
 RATINGS = {"duel@1": 0.0, "duel@2": 400.0, "duel@3": 800.0}
 
@@ -18,10 +20,12 @@ def match(position: int, contestants: tuple[str, str], *scores: float, moves: in
 
 
 def greatest_upsets(matches: list[Match], limit: int = 3) -> list[tuple[str, int, str]]:
-    finder = UpsetFinder(RATINGS, limit)
-    for each in matches:
-        finder.see(each)
-    return [(found.match, found.game, found.better) for found in finder.greatest()]
+    return [(upset.match, upset.game, upset.better) for upset in upsets_of(matches, limit)]
+
+
+def upsets_of(matches: list[Match], limit: int) -> list[Upset]:
+    of_pairs = examples(matches, [[game_digest(match, game) for game in match.games] for match in matches])
+    return game_records.greatest_upsets(RATINGS, of_pairs, of_pairs.__getitem__, limit)
 
 
 def test_the_least_expected_results_come_first() -> None:
@@ -36,9 +40,7 @@ def test_the_least_expected_results_come_first() -> None:
 def test_an_expected_result_is_not_an_upset_but_a_draw_of_unequals_is() -> None:
     assert greatest_upsets([match(0, ("duel@1", "duel@2"), 0.0, 0.5)]) == [("s/0", 1, "duel@1")]
     assert greatest_upsets([match(0, ("duel@1", "duel@2"), 0.0, 0.0)]) == []
-    finder = UpsetFinder(RATINGS, 1)
-    finder.see(match(0, ("duel@1", "duel@2"), 1.0))
-    (upset,) = finder.greatest()
+    (upset,) = upsets_of([match(0, ("duel@1", "duel@2"), 1.0)], limit=1)
     assert (upset.other, upset.score, round(upset.expected, 3)) == ("duel@2", 1.0, 0.091)
 
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.matches.returns import contestant_returns, returns_of_games
+from evaluation.matches.seating import contestant_returns, returns_of_games
 
 numbers = st.floats(-1e6, 1e6)
 

@@ -74,7 +74,8 @@ def play_request(
     kwargs, selection = options.pop("kwargs", {}), options.pop("selection", None)
     config, described, environment = league_and_environment(entry_point, selection, **kwargs)
     request = HumanPlayRequest(opponent="script:random", agent=agent, actions=tuple(actions), **options)
-    return human_play(request, config, described, players, environment, UNSEEN)
+    analyst = players.get(request.agent) if request.chances else None
+    return human_play(request, config, described, players, analyst, environment, UNSEEN)
 
 
 class Scripted:
@@ -270,7 +271,7 @@ def test_the_picture_is_the_view_of_the_agent_if_the_environment_has_one() -> No
 
     def brightness(hooks: EnvironmentHooks, agent: str) -> int:
         request = HumanPlayRequest(opponent="script:first", agent=agent)
-        picture = human_play(request, config, described, players, environment, hooks).picture
+        picture = human_play(request, config, described, players, None, environment, hooks).picture
         assert picture is not None
         return int(np.asarray(Image.open(BytesIO(b64decode(picture.partition(",")[2]))).convert("L"))[0, 0])
 

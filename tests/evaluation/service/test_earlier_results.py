@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from evaluation.matches.tournament import evaluate
-from evaluation.service.earlier_results import earlier_results
-from evaluation.service.snapshots import refresh
+from evaluation.service.snapshots import earlier_results, refresh
 from league.conditions import GameChange
 from league.registry.registry import Registry
 from league.registry.snapshots import earlier_part

@@ -1,6 +1,5 @@
 """Evaluation processes: the ledger keeps their games if they or their service die."""
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -20,6 +19,7 @@ from league.results.ledger import Ledger
 from league.settings import Storage
 from tests.support.databases import StorageAt, on_both_databases
 from tests.support.leagues import tictactoe
+from tests.support.processes import running_module
 from tests.support.templates import copy_of
 from tests.support.waiting import until
 
@@ -40,12 +40,8 @@ def _with_two_versions(storage: Storage) -> Registry:
 @pytest.fixture
 def registry(tmp_path: Path, storage_at: StorageAt, monkeypatch: pytest.MonkeyPatch) -> Iterator[Registry]:
     opened = copy_of(_with_two_versions, storage_at(tmp_path / "home"))
-    for name, value in (
-        ("LEAGUE_HOME", opened.storage.home),
-        ("LEAGUE_DATABASE_URL", opened.storage.database_url),
-        ("LEAGUE_ARTIFACTS", opened.storage.artifacts),
-    ):
-        monkeypatch.setenv(name, str(value))
+    for name, value in opened.storage.environment.items():
+        monkeypatch.setenv(name, value)
     yield opened
     opened.close()
 
@@ -98,10 +94,10 @@ def test_an_evaluation_that_does_not_stop_is_killed(registry: Registry, monkeypa
     evaluation = submit(registry, blocks=8)
     with running(registry):
         until(lambda: evaluation().progress is not None)
-        (process,) = jobs_below(os.getpid())
+        (process,) = running_module("evaluation.service.evaluation_job")
         registry.evaluations.stop(tictactoe.LEAGUE, evaluation().id, actor="ada")
         until(lambda: evaluation().state == "stopped")
-        assert process not in jobs_below(os.getpid())
+        assert process not in running_module("evaluation.service.evaluation_job")
 
 
 def test_an_exception_of_the_environment_is_reported(registry: Registry) -> None:
@@ -131,7 +127,7 @@ def test_an_evaluation_continues_after_its_service_was_killed(registry: Registry
         [sys.executable, "-c", SERVICE], cwd=Path(__file__).parents[3], stdin=subprocess.PIPE
     ) as service:
         until(lambda: evaluation().progress is not None)
-        (process,) = jobs_below(service.pid)
+        (process,) = running_module("evaluation.service.evaluation_job", service.pid)
         service.kill()
     until(lambda: evaluation().state == "queued" and not Path(f"/proc/{process}").exists())
     before = positions(registry, LONG)
@@ -153,12 +149,3 @@ def test_an_evaluation_whose_process_dies_repeatedly_fails(registry: Registry, m
     assert error is not None
     assert error["code"] == "worker_lost"
     assert registry.evaluations.claim("another", 1) is None
-
-
-def jobs_below(parent: int) -> list[int]:
-    """The ids of the runner processes of a process."""
-    children = Path(f"/proc/{parent}/task").glob("*/children")
-    found = [int(child) for path in children for child in path.read_text().split()]
-    return [
-        child for child in found if b"evaluation.service.evaluation_job" in Path(f"/proc/{child}/cmdline").read_bytes()
-    ]

@@ -10,7 +10,6 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
-from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
@@ -44,6 +43,7 @@ from league.service_requests import (
 )
 from tests.support.leagues import tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
+from tests.support.processes import running_module
 
 LONG = 120.0
 
@@ -60,12 +60,8 @@ def registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
         )
         opened.leagues.register(config, interface(config))
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (
-            ("LEAGUE_HOME", opened.storage.home),
-            ("LEAGUE_DATABASE_URL", opened.storage.database_url),
-            ("LEAGUE_ARTIFACTS", opened.storage.artifacts),
-        ):
-            patch.setenv(name, str(value))
+        for name, value in opened.storage.environment.items():
+            patch.setenv(name, value)
         yield opened
     opened.close()
 
@@ -104,15 +100,6 @@ def document_of(answer: GameResponse) -> dict[str, Any]:
     return dict(json.loads(answer.content))
 
 
-def worker_processes() -> list[int]:
-    """The worker processes of this process."""
-    paths = Path(f"/proc/{os.getpid()}/task").glob("*/children")
-    found = [int(child) for path in paths for child in path.read_text().split()]
-    return [
-        child for child in found if b"evaluation.service.game_worker" in Path(f"/proc/{child}/cmdline").read_bytes()
-    ]
-
-
 def test_playable_agents_are_listed(shared: GameWorkerPool) -> None:
     assert document_of(submit(shared, PlayabilityRequest())) == {
         "league": LEAGUE,
@@ -136,6 +123,16 @@ def test_playable_agents_are_listed(shared: GameWorkerPool) -> None:
         "board_area": [0.02, 0.02, 0.99, 0.97],
         "reveals": False,
     }
+
+
+def test_a_pool_is_in_use_for_some_minutes_after_a_request(
+    shared: GameWorkerPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit(shared, PlayabilityRequest())
+    assert shared.is_in_use
+    monkeypatch.setattr(game_worker_pool, "IDLE", 0.0)
+    submit(shared, PlayabilityRequest())
+    assert not shared.is_in_use
 
 
 def test_a_process_that_cannot_be_started_is_tried_again(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,9 +162,9 @@ def test_a_game_against_a_version_is_played(shared: GameWorkerPool) -> None:
     assert [step["moves"][0]["action"] for step in state["steps"][1:]] == [4, state["steps"][2]["moves"][0]["action"]]
     assert state["picture"].startswith("data:image/png;base64,")
     assert state["chances"][0][0] in state["legal"]
-    processes = worker_processes()
+    processes = running_module("evaluation.service.game_worker")
     submit(shared, play_request(5))
-    assert worker_processes() == processes, "one process per league"
+    assert running_module("evaluation.service.game_worker") == processes, "one process per league"
 
 
 def test_errors_keep_their_type(shared: GameWorkerPool) -> None:
@@ -230,7 +227,7 @@ def test_a_process_that_dies_is_reported_and_replaced(registry: Registry) -> Non
         with pytest.raises(WorkerLost, match="plays games of dying died"):
             submit(pool, play_request(0, opponent="script:random"), "dying")
         assert document_of(submit(pool, PlayabilityRequest(), "dying"))["playable"]
-        (process,) = worker_processes()[-1:]
+        (process,) = running_module("evaluation.service.game_worker")[-1:]
         os.kill(process, signal.SIGKILL)
         assert document_of(submit(pool, play_request(opponent="script:random"), "dying"))["legal"]
 
@@ -277,9 +274,9 @@ def test_idle_leagues_are_evicted_but_not_during_a_game(registry: Registry) -> N
                 await hung
             await pool.submit(game_request(PlayabilityRequest()), LONG)
 
-        before = worker_processes()
+        before = running_module("evaluation.service.game_worker")
         asyncio.run(submit_several())
-        assert len(set(worker_processes()) - set(before)) == 1
+        assert len(set(running_module("evaluation.service.game_worker")) - set(before)) == 1
 
 
 def test_the_number_of_waiting_requests_is_limited(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:

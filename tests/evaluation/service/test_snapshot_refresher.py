@@ -1,16 +1,17 @@
 """Snapshots follow each change; they are computed by one process at a time, which ends with its service."""
 
+import asyncio
 import logging
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from evaluation.matches.tournament import evaluate
-from evaluation.service import snapshot_refresher
+from evaluation.service import deployment, snapshot_refresher
 from evaluation.service.deployment import EvaluationService
 from evaluation.service.snapshot_refresher import SnapshotRefresher
 from league.environments.building import interface
@@ -18,19 +19,16 @@ from league.registry.registry import Registry
 from league.registry.snapshots import SnapshotRepository
 from tests.support.leagues import tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
+from tests.support.processes import running_module
 from tests.support.waiting import until
 
 
 @pytest.fixture
 def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Registry]:
     opened = tictactoe.registry(tmp_path / "home")
-    for name, value in (
-        ("LEAGUE_HOME", opened.storage.home),
-        ("LEAGUE_DATABASE_URL", opened.storage.database_url),
-        ("LEAGUE_ARTIFACTS", opened.storage.artifacts),
-    ):
-        monkeypatch.setenv(name, str(value))
-    monkeypatch.setattr(snapshot_refresher, "POLL_INTERVAL", 0.01)
+    for name, value in opened.storage.environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(snapshot_refresher, "POLL_INTERVAL", 0.1)
     monkeypatch.setattr(snapshot_refresher, "IDLE_FACTOR", 0)
     yield opened
     opened.close()
@@ -68,8 +66,8 @@ def test_snapshots_follow_the_ledger(registry: Registry, caplog: pytest.LogCaptu
         until(lambda: games(registry) == first)
         second = play(registry, seed=2)
         until(lambda: games(registry) == first + second)
-        assert refresher.is_running
-    assert not refresher.is_running
+        assert refresher.is_alive()
+    assert not refresher.is_alive()
     assert "failed" not in caplog.text, "processes exit with status 0"
 
 
@@ -109,10 +107,14 @@ def test_refreshing_resumes_when_the_database_is_back(registry: Registry, caplog
 
 @pytest.mark.usefixtures("ray_session")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_an_evaluation_service_has_a_refresher(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_evaluation_service_works_until_snapshots_are_current(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(deployment, "POLL", 0.1)
     service = EvaluationService(workers=1, at_once=1)
     play(registry, seed=1)
-    until(lambda: registry.snapshots.stale() == [])
+    asyncio.run(service.work())
+    assert registry.snapshots.stale() == []
     service.check_health()
 
     def raise_error(_: SnapshotRepository) -> list[str]:
@@ -134,7 +136,7 @@ SERVICE = """
 import sys
 from evaluation.service import snapshot_refresher
 from league.registry.registry import Registry
-snapshot_refresher.POLL_INTERVAL, snapshot_refresher.IDLE_FACTOR = 0.01, 0
+snapshot_refresher.POLL_INTERVAL, snapshot_refresher.IDLE_FACTOR = 0.1, 0
 snapshot_refresher.SnapshotRefresher(Registry.open()).start()
 sys.stdin.read()
 """
@@ -145,20 +147,9 @@ def test_a_process_ends_with_its_service_and_the_next_one_starts_over(registry: 
     with subprocess.Popen(
         [sys.executable, "-c", SERVICE], cwd=Path(__file__).parents[3], stdin=subprocess.PIPE
     ) as service:
-        until(lambda: len(snapshot_processes(service.pid)) == 1)
-        (process,) = snapshot_processes(service.pid)
+        until(lambda: len(running_module("evaluation.service.snapshots", service.pid)) == 1)
+        (process,) = running_module("evaluation.service.snapshots", service.pid)
         service.kill()
     until(lambda: not Path(f"/proc/{process}").exists())
     with running(registry):
         until(lambda: registry.snapshots.stale() == [])
-
-
-def snapshot_processes(parent: int) -> list[int]:
-    """The ids of the child processes that compute snapshots."""
-    children = Path(f"/proc/{parent}/task").glob("*/children")
-    found = [int(child) for path in children for child in path.read_text().split()]
-    with suppress(FileNotFoundError):
-        return [
-            child for child in found if b"evaluation.service.snapshots" in Path(f"/proc/{child}/cmdline").read_bytes()
-        ]
-    return []

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from evaluation.gating import evidence
 from evaluation.gating.evidence import verdict_of
 from evaluation.gating.verdicts import open_verdict, void
 from evaluation.matches.game_records import unique_games
@@ -23,6 +24,7 @@ from league.errors import AlreadyRunning, UnknownLeague
 from league.registry.registry import Registry
 from league.registry.storage.rows import SnapshotRow
 from league.results.ledger import Ledger
+from league.results.sums import tally
 from league.settings import Storage
 from tests.support.leagues import reported_league, tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
@@ -94,7 +96,7 @@ def test_the_leaderboard_and_the_payoffs_are_those_of_the_ledger(registry: Regis
     refs = [standing["ref"] for standing in expected]
     payoff = dict(snapshot(registry, "payoff").document)
     shares = payoff.pop("shares")
-    assert payoff == tabulate(refs, ["player_1", "player_2"], matches).to_json()
+    assert payoff == tabulate(refs, ["player_1", "player_2"], tally(matches)).to_json()
     assert {share["ref"] for share in shares} == set(refs), "a round robin has all pairs"
     assert sum(share["nash"] for share in shares) == pytest.approx(1)
     versions = snapshot(registry, "ratings").document["versions"]
@@ -250,14 +252,13 @@ def test_a_failing_verdict_does_not_affect_the_others(
             open_verdict(registry, registry.leagues.get(LEAGUE), 1, "script:random"),
             open_verdict(registry, registry.leagues.get(LEAGUE), 1, "script:one_ply"),
         )
-        compute_evidence = snapshots.verdict_of
 
         def fail_for_second(registry: Registry, verdict: Any) -> Any:
             if verdict.id == second.id:
                 raise ZeroDivisionError
-            return compute_evidence(registry, verdict)
+            return verdict_of(registry, verdict)
 
-        monkeypatch.setattr(snapshots, "verdict_of", fail_for_second)
+        monkeypatch.setattr(evidence, "verdict_of", fail_for_second)
         with caplog.at_level(logging.ERROR):
             refresh(registry, LEAGUE)
         assert registry.snapshots.marks(LEAGUE).keys() == PARTS | {f"verdict/{first.id}"}

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from evaluation.matches.worker import MatchWorker
-from evaluation.service import strength
-from evaluation.service.strength import measure_export, measure_strength, opponents_of
+from evaluation.service import strength_worker
+from evaluation.service.strength_worker import measure_export, measure_strength, opponents_of
 from league.policies.loading import strength_opponents
 from league.registry.registry import Registry
-from league.registry.storage.exports import export_version
+from league.registry.storage.exports import exported_files, write_files
 from league.results.ledger import Ledger
 from tests.support.leagues import tictactoe
 
@@ -64,7 +64,7 @@ def test_trials_play_the_champion_and_all_anchors(registry: Registry) -> None:
 
 def test_exported_files_play_as_their_version_does(registry: Registry, tmp_path: Path) -> None:
     version = registry.versions.get(tictactoe.LEAGUE, 3)
-    export_version(version, registry.artifacts, tmp_path / "files")
+    write_files(exported_files(version, registry.artifacts), tmp_path / "files")
     file = tmp_path / "files" / "manifest.json"
     file.write_text(version.manifest.model_copy(update={"version": 0}).to_json())
     promote(registry, 1)
@@ -112,6 +112,6 @@ def test_versions_play_the_same_openings(registry: Registry, monkeypatch: pytest
 
 
 def test_a_slow_environment_ends_the_matches_early(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(strength, "MOST_SECONDS", 0.0)
+    monkeypatch.setattr(strength_worker, "MOST_SECONDS", 0.0)
     (row,) = measure_strength(registry, worker(registry), 3, 1000)
     assert row.games == 8, "one chunk, with a game in each environment"

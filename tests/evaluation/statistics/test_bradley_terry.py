@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from evaluation.statistics.bradley_terry import ELO, Rating, bradley_terry, rate
 from evaluation.statistics.sequential import score_of
-from league.results.records import BlockResult
+from league.results.records import Outcome
 from tests.support.closeness import close
 
 RANDOM = "script:random"
@@ -30,10 +30,10 @@ FOOD_GAMES = {
 FOOD_STRENGTHS = (0.434290, 0.190600, 0.147977, 0.128153, 0.098980)
 
 
-def block(first: str, second: str, score: float, games: int = 2) -> BlockResult:
+def block(first: str, second: str, score: float, games: int = 2) -> Outcome:
     """A block with this mean score of the first contestant."""
     points = (score * games, (1 - score) * games)
-    return BlockResult("schedule", 0, (first, second), games, points, (0.0, 0.0))
+    return Outcome((first, second), games, points)
 
 
 def fitted(games: dict[tuple[int, int], tuple[float, float]], size: int) -> np.ndarray:
@@ -44,7 +44,7 @@ def fitted(games: dict[tuple[int, int], tuple[float, float]], size: int) -> np.n
 
 def simulated(
     elos: Sequence[float], blocks: int, rng: np.random.Generator, names: Sequence[str] | None = None
-) -> list[BlockResult]:
+) -> list[Outcome]:
     """Blocks of a round robin between contestants of known strength; contestant 0 is `script:random`."""
     names = names or [RANDOM, *(f"league@{i}" for i in range(1, len(elos)))]
     return [
@@ -113,9 +113,7 @@ def test_ratings_do_not_depend_on_the_order_of_blocks(random: object) -> None:
     blocks = simulated([0, 50, 120, 90], 10, np.random.default_rng(3))
     shuffled = list(blocks)
     random.shuffle(shuffled)  # type: ignore[attr-defined]
-    reversed_blocks = [
-        BlockResult("schedule", 0, b.contestants[::-1], b.games, b.scores[::-1], b.returns) for b in shuffled
-    ]
+    reversed_blocks = [Outcome(b.contestants[::-1], b.games, b.scores[::-1]) for b in shuffled]
     assert close(rate(reversed_blocks, RANDOM, resamples=50), rate(blocks, RANDOM, resamples=50))
 
 

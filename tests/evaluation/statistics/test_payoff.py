@@ -7,6 +7,7 @@ from hypothesis.extra.numpy import arrays
 from evaluation.statistics.payoff import score_interval, tabulate
 from evaluation.statistics.population import resampled_interval, resampled_scores
 from league.results.equilibria import alpha_rank, nash_averaging
+from league.results.sums import tally
 from tests.support.closeness import close
 from tests.support.leagues.payoff_matches import match
 
@@ -17,7 +18,7 @@ def test_scores_games_and_sides() -> None:
     payoff = tabulate(
         ("a", "b", "c"),
         SIDES,
-        [match(("a", "b"), (1.0, 0.5)), match(("b", "a"), (1.0, 0.0)), match(("c", "b"), (1, 1))],
+        tally([match(("a", "b"), (1.0, 0.5)), match(("b", "a"), (1.0, 0.0)), match(("c", "b"), (1, 1))]),
     )
     assert payoff.contestants == ("a", "b", "c")
     assert close(payoff.score, ((None, 0.625, None), (0.375, None, 0.0), (None, 1.0, None)))
@@ -27,7 +28,7 @@ def test_scores_games_and_sides() -> None:
 
 
 def test_without_matches_the_table_is_empty() -> None:
-    assert tabulate(("a",), SIDES, []).score == ((None,),)
+    assert tabulate(("a",), SIDES, {}).score == ((None,),)
 
 
 ROCK_PAPER_SCISSORS = np.array([[0.5, 0.0, 1.0], [1.0, 0.5, 0.0], [0.0, 1.0, 0.5]])
@@ -131,7 +132,7 @@ def test_intervals_with_little_evidence_are_wide() -> None:
     many = few * 50
     spread = []
     for matches in (few, many):
-        tables = resampled_scores(names, matches, resamples=100)
+        tables = resampled_scores(names, tally(matches), resamples=100)
         assert tables[0] == pytest.approx(0.5 + 0.25 * np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]))
         low, high = resampled_interval(np.stack([nash_averaging(2 * table - 1)[0] for table in tables]))
         spread.append((high - low).max())
@@ -140,7 +141,7 @@ def test_intervals_with_little_evidence_are_wide() -> None:
 
 def test_an_incomplete_table_is_rejected() -> None:
     with pytest.raises(ValueError, match="a and c never met"):
-        resampled_scores(("a", "b", "c"), [match(("a", "b"), (1, 0)), match(("b", "c"), (1, 0))])
+        resampled_scores(("a", "b", "c"), tally([match(("a", "b"), (1, 0)), match(("b", "c"), (1, 0))]))
 
 
 @pytest.mark.parametrize("scores", [[0.5], [[0.5, 1.0], [0.5, 0.5]], np.zeros((2, 3))])

@@ -31,7 +31,10 @@ def test_only_league_and_environment_are_required() -> None:
         ({"environment": {}}, "environment.entry_point: missing, but required"),
         ({"gate": {"alpha": 2}}, "gate.alpha: input should be less than 0.5, got 2"),
         ({"gate": {"elo0": 10, "elo1": 5}}, "gate: elo1 must be greater than elo0 (10)"),
-        ({"training": {"algorithm": "dqm"}}, f"training.algorithm: expected one of {', '.join(ALGORITHMS)}, got 'dqm'"),
+        (
+            {"training": {"algorithm": "dqm"}},
+            f"training.algorithm: expected one of {', '.join(ALGORITHMS)}, or package.module:Class, got 'dqm'",
+        ),
         (
             {"training": {"steps": 2**70}},
             "training.steps: 1180591620717411303424, expected integers of at",
@@ -43,6 +46,14 @@ def test_only_league_and_environment_are_required() -> None:
         ({"training": {"lr": "fast"}}, "training.lr: expected a number, got 'fast'"),
         ({"training": {"lrr": 1}}, "training.lrr: unknown key, did you mean 'lr'?"),
         ({"training": {"algorithm": "dqn", "epochs": 4}}, "training.epochs: unknown key, "),
+        (
+            {"training": {"algorithm": "dqn", "learners": 2}},
+            "training.learners: expected 1, since only ppo supports several learners; got 2",
+        ),
+        (
+            {"training": {"algorithm": "dqn", "batch_scale": 2}},
+            "training.batch_scale: expected 1, since only ppo scales its batches; got 2",
+        ),
         ({"training": {"algorithm": "dqn", "n_stepp": 4}}, "training.n_stepp: unknown key, did you mean 'n_step'?"),
         (
             {"training": {"algorithm": "dqn", "exploration": {"finall": 0}}},
@@ -54,6 +65,8 @@ def test_only_league_and_environment_are_required() -> None:
             {"training": {"algorithm": "dqn", "distributional": {"low": 1, "high": -1}}},
             "training.distributional: high must be greater than low (1)",
         ),
+        ({"training": {"lag": -1}}, "training.lag: input should be greater than or equal to 0, got -1"),
+        ({"training": {"lag": 9}}, "training.lag: input should be less than or equal to 8, got 9"),
         ({"training": {"minibatch_size": 4096, "train_batch_size": 64}}, "minibatch_size must be at most"),
         ({"training": {"magnet": {"ref": "previous", "weight": 1}}}, "magnet.every is required for ref: previous"),
         ({"training": {"magnet": {"ref": "uniform", "weight": 1, "every": 9}}}, "and only there"),

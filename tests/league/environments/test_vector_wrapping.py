@@ -146,7 +146,7 @@ def test_frames_of_an_abandoned_episode_are_forgotten() -> None:
     assert frames[:, 1].any(axis=1).all()
 
 
-WRAPPING, TRANSFORMS = "league.environments.vector_wrapping", "league.environments.transforms"
+WRAPPING, TRANSFORMS = "league.environments.vector_wrapping", "league.environments.wrappers.transforms"
 MUTANTS = [
     (TRANSFORMS, "self._frames[slots] = 0", "pass"),
     (TRANSFORMS, "self._frames[slots] = 0", "self._frames[:] = 0"),

@@ -16,7 +16,8 @@ import os, re, sys, threading
 import psutil, ray
 from ray._private import services
 from league.local_ray import loopback_node, token
-from league.ray_cluster import LocalRay, join, ray_session, start_local
+from ray._private.authentication.http_token_authentication import get_auth_headers_if_auth_enabled
+from league.ray_cluster import PRELOAD, LocalRay, join, ray_session, start_local
 
 loopback_node.NOTICE = 0.2
 this = psutil.Process()
@@ -55,6 +56,32 @@ command = [sys.executable, "-c", "import sys; " + script, address]
 refused = subprocess.run(command, env=strangers, capture_output=True, text=True)
 assert "ConfigError: no Ray cluster" in refused.stderr and "CPU" not in refused.stdout, refused
 """
+PROCESSES = """
+start_local(LocalRay(cpus=1))
+print(run_a_task())
+names = [process.name() for process in this.children(recursive=True) if not process.name().startswith("ray::")]
+assert sorted(names) == ["cat", "cat", "gcs_server", "raylet"], names
+agents, (raylet,) = below("cat"), below("raylet")
+raylet.kill()
+_, alive = psutil.wait_procs(agents, timeout=60)
+print("agents that survive the raylet:", len(alive))
+"""
+WAITING_WORKERS = """
+start_local(LocalRay(cpus=1, preload="wave"))
+while not (waiting := below("ray::IDLE")):
+    pass
+
+@ray.remote(num_cpus=1)
+class Actor:
+    def state(self):
+        return os.getpid(), "wave" in sys.modules
+
+pid, has_module = ray.get(Actor.remote().state.remote())
+assert pid in [worker.pid for worker in waiting]
+variables = [PRELOAD, *loopback_node.LIMITS, *loopback_node.WITHOUT_AGENTS, *loopback_node.WAITING_WORKERS]
+assert not [name for name in variables if name in os.environ], "another node would inherit them"
+print("imported before:", has_module)
+"""
 SLOW_AGENTS = """
 stopped = {}
 is_over = threading.Event()
@@ -68,7 +95,7 @@ def stop_agents():
 
 thread = threading.Thread(target=stop_agents)
 thread.start()
-start_local(LocalRay(cpus=1))
+start_local(LocalRay(cpus=1, dashboard=True))
 is_over.set()
 thread.join()
 print(run_a_task(), "while", len(stopped), "agent is stopped")
@@ -99,17 +126,18 @@ DEAD_RAYLETS = """
 from league import ray_cluster
 from league.errors import NotReady
 
-killed = []
 most = int(sys.argv[1])
+killed = []
+start_ray_process = services.start_ray_process
 
-def kill_raylets():
-    while len(killed) < most:
-        for process in below("raylet"):
-            if process.pid not in killed and process.status() != psutil.STATUS_ZOMBIE:
-                killed.append(process.pid)
-                process.kill()
+def start_and_kill(command, process_type, *arguments, **options):
+    started = start_ray_process(command, process_type, *arguments, **options)
+    if process_type == "raylet" and len(killed) < most:
+        killed.append(started)
+        started.process.kill()  # before it can register
+    return started
 
-threading.Thread(target=kill_raylets, daemon=True).start()
+services.start_ray_process = start_and_kill
 try:
     start_local(LocalRay(cpus=1))
     print(run_a_task(), "after", len(killed), "was killed")
@@ -124,7 +152,8 @@ for _ in range(2):
         start_local(LocalRay(cpus=1))
         print(run_a_task())
         tokens.append(os.environ[token.TOKEN])
-assert token.TOKEN not in os.environ
+assert not os.environ.keys() & {token.TOKEN, token.MODE}, "a cluster has another token, or none"
+assert get_auth_headers_if_auth_enabled({}) == {}
 assert tokens[0] != tokens[1] and len(tokens[0]) >= 32
 """
 
@@ -147,6 +176,14 @@ def run(script: str, home: Path, *arguments: str) -> subprocess.CompletedProcess
 def test_it_listens_on_loopback_and_requires_its_token(tmp_path: Path) -> None:
     assert "a task ran" in run(LISTENERS, tmp_path).stdout
     assert not (tmp_path / ".ray").exists(), "Ray's own token would be readable by everybody"
+
+
+def test_it_starts_no_process_that_it_does_not_need(tmp_path: Path) -> None:
+    assert "agents that survive the raylet: 0" in run(PROCESSES, tmp_path).stdout
+
+
+def test_a_waiting_worker_that_has_imported_a_module_becomes_an_actor(tmp_path: Path) -> None:
+    assert "imported before: True" in run(WAITING_WORKERS, tmp_path).stdout
 
 
 @pytest.mark.slow

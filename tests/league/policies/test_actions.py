@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from league.errors import ConfigError
-from league.policies.actions import dist_inputs_size, to_environment
+from league.policies.actions import dist_inputs_size, from_environment, to_environment
 from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
 from league.spaces.arrays import bounds
 from league.spaces.conversion import from_gymnasium, to_gymnasium
@@ -54,6 +54,16 @@ def test_actions_are_inside_their_space(raw: np.ndarray, dtype: str) -> None:
     actions = to_environment(raw, rounded)
     assert actions.dtype == np.dtype(dtype)
     assert all(to_gymnasium(rounded).contains(action) for action in actions)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([Discrete(n=5, start=-1), PAIRS, MIXED]))
+def test_actions_of_the_environment_become_raw_actions(seed: int, space: Space) -> None:
+    sampled = to_gymnasium(space)
+    sampled.seed(seed)
+    actions = np.stack([sampled.sample() for _ in range(3)])
+    raw = from_environment(actions, space)
+    assert raw.shape == ((3,) if isinstance(space, Discrete) else (3, 4))
+    assert np.allclose(to_environment(raw, space), actions, atol=1e-5)
 
 
 def test_bounds_have_the_shape_of_the_space() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from league.errors import EnvironmentMismatch, RemoteError
 from league.interface import AgentInterface
-from league.policies.open_inference_signature import read_signature
+from league.policies.open_inference import read_signature
 from league.spaces import Box, DictSpace, Discrete
 
 SPACES = AgentInterface(

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.random.seed_sequence import generate_state
+from league.random.pcg64 import generate_state
 
 words = st.integers(0, 2**32 - 1)
 

@@ -10,6 +10,7 @@ from sqlalchemy import update
 from league.errors import KeyReused, TooManyEvaluations, UnknownEvaluation, UnknownLeague
 from league.registry.evaluations import HEARTBEAT_TIMEOUT, MAX_ATTEMPTS
 from league.registry.registry import Registry
+from league.registry.snapshots import SUMMARY
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import EvaluationRow
 from tests.support.leagues.registries import LEAGUE
@@ -49,6 +50,18 @@ def test_an_evaluation_is_submitted_claimed_and_completed(registry: Registry) ->
     assert (ended.state, ended.result, ended.progress, ended.error) == ("done", {"games": 24}, progress, None)
     assert submitted.created_at <= claimed.started_at <= ended.ended_at  # type: ignore[operator]
     assert registry.evaluations.counts() == {}
+
+
+def test_the_service_is_needed_while_snapshots_are_outdated_or_evaluations_are_active(registry: Registry) -> None:
+    assert registry.needs_evaluation_service()
+    registry.snapshots.put(LEAGUE, {SUMMARY: {}}, registry.snapshots.current_marks()[LEAGUE])
+    assert not registry.needs_evaluation_service()
+    submitted = submit(registry)
+    assert registry.needs_evaluation_service()
+    registry.evaluations.claim("a", workers=1)
+    assert registry.needs_evaluation_service()
+    registry.evaluations.finish(submitted.id, "a", "done", result={})
+    assert not registry.needs_evaluation_service()
 
 
 def test_the_oldest_is_claimed_first_and_by_one_runner(registry: Registry) -> None:

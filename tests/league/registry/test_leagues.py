@@ -73,8 +73,8 @@ def test_a_change_of_the_game_is_reported_once_it_concerns_results(
     assert len(caplog.messages) == 1
     assert "the game has changed: play.opening_plies 0 → 4. Earlier results can be viewed" in caplog.messages[0]
     row = registry.leagues.get(LEAGUE)
-    assert ledger.results(LEAGUE, row.game_digest) == []
-    assert len(ledger.results(LEAGUE)) == 1
+    assert ledger.counted(LEAGUE, row.conditions) == []
+    assert ledger.counted(LEAGUE, SCHEDULE.conditions) == [SCHEDULE]
     assert row.environment_digest == SCHEDULE.environment_digest
 
 

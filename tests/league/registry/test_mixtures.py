@@ -59,7 +59,7 @@ def test_history_and_rollback_treat_it_as_one(registry: Registry) -> None:
     [
         ({1: 0.5, 9: 0.5}, UnknownVersion, "has no version 9; the newest is 5"),
         ({1: 0.5, 2: 0.4}, InvalidInput, "sum to 0.9, expected 1"),
-        ({1: 0.5, 4: 0.5}, InvalidInput, r"tictactoe@4 is a mixture \(@1 60.0 %, @2 40.0 %\): the members"),
+        ({1: 0.5, 4: 0.5}, InvalidInput, r"tictactoe@4 is a mixture \(@1 60.0 %, @2 40.0 %\): name one"),
         ({1: 0.5, 3: 0.5}, NotPromotable, "tictactoe@3 has the role exploiter"),
         ({1: 0.5, 5: 0.5}, EnvironmentMismatch, "tictactoe@1 and tictactoe@5 were trained in different environments"),
     ],

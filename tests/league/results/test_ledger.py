@@ -1,6 +1,7 @@
 """The ledger accepts the matches of its schedules, each once, and returns them exactly."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,9 +10,11 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sqlalchemy import delete, update
 
 from league.errors import InvalidInput, LedgerConflict, NotFound, OutOfSpace, UnknownLeague
 from league.registry.registry import Registry
+from league.registry.storage import tables
 from league.results import ledger as ledger_module
 from league.results.ledger import Ledger
 from league.results.records import (
@@ -26,6 +29,7 @@ from league.results.records import (
     load_games,
     load_schedule,
 )
+from league.results.sums import GameSums, whole
 from league.settings import Storage
 from tests.support.leagues.ledger_matches import SCHEDULE, game, play_match
 from tests.support.leagues.registries import LEAGUE, registered
@@ -116,15 +120,16 @@ def test_results_are_sums_over_blocks(ledger: Ledger) -> None:
     for schedule in (other, SCHEDULE):
         ledger.open(schedule)
         ledger.extend([play_match(schedule, position) for position in (2, 1)])
-    mine = [
-        BlockResult(SCHEDULE.id, 1, ("tictactoe@1", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
-        BlockResult(SCHEDULE.id, 2, ("tictactoe@2", "script:random"), 2, (1.5, 0.5), (1.25, -0.75)),
-    ]
-    assert ledger.results(LEAGUE, SCHEDULE.conditions) == mine
-    assert [result.schedule for result in ledger.results(LEAGUE)] == [other.id] * 2 + [SCHEDULE.id] * 2
-    assert ledger.results(LEAGUE, SCHEDULE.conditions._replace(actions="sampled")) == []
+    assert ledger.counted(LEAGUE, SCHEDULE.conditions) == [SCHEDULE]
+    assert ledger.counted(LEAGUE, other.conditions) == [other]
+    assert ledger.counted(LEAGUE, SCHEDULE.conditions._replace(actions="sampled")) == []
+    pair = ("script:random", "tictactoe@1")
+    of_pair = GameSums(Counter({(2, 1, 3): 1}), 1, 2, (-0.75, 1.25), -1, 1)  # type: ignore[arg-type]
+    assert whole(ledger.sums(LEAGUE, [SCHEDULE], between=pair)) == {pair: of_pair}
+    assert whole(ledger.sums(LEAGUE, [SCHEDULE])) == {pair: of_pair, ("script:random", "tictactoe@2"): of_pair}
+    assert ledger.sums(LEAGUE, [SCHEDULE, other])[pair].matches == 2
     with pytest.raises(UnknownLeague):
-        ledger.results("chess")
+        ledger.counted("chess", SCHEDULE.conditions)
 
 
 def test_a_block_with_a_forfeit_has_scores_but_no_returns(ledger: Ledger) -> None:
@@ -134,7 +139,8 @@ def test_a_block_with_a_forfeit_has_scores_but_no_returns(ledger: Ledger) -> Non
     match = SCHEDULE.match(0, (lost, second))
     ledger.append(match)
     assert ledger.matches(league=LEAGUE) == [match]
-    assert ledger.results(LEAGUE) == [match.result()]
+    sums = ledger.sums(LEAGUE, [SCHEDULE])["tictactoe@1", "tictactoe@2"].whole
+    assert (sums.points, sums.played, sums.complete) == ((0.5, 1.5), 2, 0)
     assert match.result() == BlockResult(SCHEDULE.id, 0, match.contestants, 2, (0.5, 1.5), None)
     assert match.mean_return(0) is None
 
@@ -237,7 +243,8 @@ def test_a_block_of_solo_games_is_one_comparison(ledger: Ledger) -> None:
     assert (won, lost) == (solo_match(schedule, 0, 3.5, 2.0), solo_match(schedule, 1, 3.5, 4.0))
     assert (won.score(0), won.score(1), lost.score(0)) == (1.0, 0.0, 0.0)
     assert (won.mean_return(0), won.mean_return(1)) == (3.5, 2.0)
-    assert ledger.results(LEAGUE) == [won.result(), lost.result()]
+    sums = ledger.sums(LEAGUE, [schedule])
+    assert [(of_pair.points, of_pair.played) for of_pair in whole(sums).values()] == [((1.0, 0.0), 1), ((1.0, 0.0), 1)]
     assert won.result() == BlockResult(schedule.id, 0, won.contestants, 1, (1.0, 0.0), (3.5, 2.0))
 
 
@@ -381,3 +388,18 @@ def test_games_survive_serialization(games: tuple[Game, ...]) -> None:
 def test_schedules_survive_serialization(seed: int) -> None:
     schedule = replace(SCHEDULE, seed=seed)
     assert load_schedule(dump_schedule(schedule)) == schedule
+
+
+def test_sums_that_differ_from_the_matches_are_found_and_replaced(ledger: Ledger, storage: Storage) -> None:
+    ledger.open(SCHEDULE)
+    ledger.extend([play_match(SCHEDULE, position) for position in (0, 1, 4)])
+    before = ledger.sums(LEAGUE, [SCHEDULE])
+    with Registry.open(storage).database.write() as session:
+        session.execute(delete(tables.PairSumTable).filter_by(first="tictactoe@1"))
+        session.execute(update(tables.ScheduleTotalTable).values(matches=7))
+    expected = [f"schedule_totals of {SCHEDULE.id}", "pair_sums of tictactoe@1 tictactoe@2"]
+    assert ledger.recount(SCHEDULE, mend=False) == expected
+    assert ledger.recount(SCHEDULE) == expected
+    assert ledger.recount(SCHEDULE) == []
+    assert ledger.sums(LEAGUE, [SCHEDULE]) == before
+    assert ledger.counts(LEAGUE) == {SCHEDULE.id: 3}

@@ -4,12 +4,12 @@ import pytest
 
 from league.errors import NotFound
 from league.results.payoffs import meta_strategy
-from league.results.records import BlockResult
+from league.results.records import Outcome
 
 
-def games(first: str, second: str, score: float, count: int = 1000) -> BlockResult:
+def games(first: str, second: str, score: float, count: int = 1000) -> Outcome:
     """`count` games in which `first` has this mean score."""
-    return BlockResult("s", 0, (first, second), count, (score * count, (1 - score) * count), None)
+    return Outcome((first, second), count, (score * count, (1 - score) * count))
 
 
 CYCLE = [games("r", "s", 1.0), games("s", "p", 1.0), games("p", "r", 1.0)]
@@ -39,5 +39,5 @@ def test_versions_without_games_are_left_out() -> None:
 def test_a_league_without_games_has_none() -> None:
     with pytest.raises(NotFound, match="no two of the 2 versions have played each other"):
         meta_strategy(("a", "b"), [games("a", "script:x", 1.0)])
-    with pytest.raises(NotFound, match="the league has 0 versions, expected at least two"):
+    with pytest.raises(NotFound, match="expected at least two versions, the league has 0"):
         meta_strategy((), [])

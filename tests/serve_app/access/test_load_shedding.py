@@ -72,6 +72,20 @@ async def test_a_persistent_queue_is_shed_until_it_is_short() -> None:
     assert await loop.turn(10, 0.03) == 10, "the time starts again"
 
 
+async def test_requests_of_earlier_turns_take_places_until_they_are_answered() -> None:
+    loop = Loop(limit=10)
+    loop.backlog.queued = 8
+    assert [await loop.turn(2, 0.02) for _ in range(20)] == [2] * 20
+    for _ in range(10):
+        await loop.turn(5, 0.02)
+    assert [await loop.turn(5, 0.02) for _ in range(20)] == [2] * 20
+    await loop.idle()
+    assert await loop.turn(5, 0.02) == 2, "it is not empty yet"
+    loop.backlog.queued = 0
+    await loop.idle()
+    assert await loop.turn(20, 0.02) == 20, "the time starts again"
+
+
 async def test_occasional_bursts_are_not_shed() -> None:
     loop = Loop()
     for _ in range(20):

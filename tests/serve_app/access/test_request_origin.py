@@ -3,10 +3,15 @@
 A server without keys on loopback answers only requests that name it so.
 """
 
+import json
 from dataclasses import replace
 
+import httpx
 import pytest
 from starlette.testclient import TestClient, WebSocketDenialResponse
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
 from league.registry.registry import Registry
 from league.settings import Storage
@@ -16,6 +21,7 @@ from serve_app.app import Replica
 from serve_app.runtime.replica_process import this_process
 from tests.support.clients.actions import BOARD
 from tests.support.servers.replicas import QUICK
+from tests.support.servers.streaming import listening
 
 ACTION = "/v1/policies/board/action"
 BODY = {"observation": BOARD}
@@ -82,6 +88,52 @@ def test_our_page_can_act_and_another_can_read(read_only_client: TestClient) -> 
     )
     assert read_only_client.post(ACTION, json=BODY, headers=same_site).status_code == 200
     assert read_only_client.get("/v1/leagues", headers=cross_site).status_code == 200
+
+
+GAME = "https://game.example"
+LISTED = QUICK.model_copy(update={"cors_origins": [GAME]})
+PREFLIGHT = {"access-control-request-method": "POST", "access-control-request-headers": "authorization,content-type"}
+
+
+def allowed(reply: httpx.Response) -> str | None:
+    return reply.headers.get("access-control-allow-origin")
+
+
+def test_pages_of_listed_origins_call_with_a_key(registry: Registry) -> None:
+    """On both paths: requests without an origin take the fast one."""
+    _, secret = registry.keys.create("game", ["act"])
+    with listening(registry.storage, LISTED) as listener, httpx.Client(base_url=listener.url) as client:
+        for origin, status, answer in ((GAME, 200, GAME), ("https://game.example.evil", 400, None)):
+            reply = client.options(ACTION, headers=PREFLIGHT | {"origin": origin})
+            assert (reply.status_code, allowed(reply)) == (status, answer)
+        key = {"authorization": f"Bearer {secret}"}
+        from_page = {"origin": GAME, "sec-fetch-site": "cross-site"}
+        reply = client.post(ACTION, json=BODY, headers=key | from_page)
+        assert (reply.status_code, allowed(reply), reply.headers["access-control-expose-headers"]) == (200, GAME, "*")
+        refused = client.post(ACTION, json=BODY, headers=from_page)
+        assert (refused.status_code, allowed(refused)) == (401, GAME), "the page can read the error"
+        elsewhere = client.post(ACTION, json=BODY, headers=key | from_page | {"origin": "https://evil.example"})
+        assert (elsewhere.status_code, allowed(elsewhere)) == (403, None)
+        assert client.post(ACTION, json=BODY, headers=key).json() == reply.json()
+
+
+@pytest.mark.parametrize("key", ["", "plk_wrong"])
+def test_a_stream_of_a_listed_origin_offers_its_key_as_a_subprotocol(registry: Registry, key: str) -> None:
+    _, secret = registry.keys.create("game", ["act"])
+    with listening(registry.storage, LISTED) as listener:
+        url = listener.stream("board")
+        offered = [Subprotocol("policy-league"), Subprotocol(f"policy-league.key.{secret}")]
+        with connect(url, origin=Origin(GAME), subprotocols=offered, proxy=None) as stream:
+            assert stream.subprotocol == "policy-league"
+            stream.send(json.dumps(BODY))
+            assert json.loads(stream.recv(60))["version"] == 1
+        others = offered[:1] + [Subprotocol(f"policy-league.key.{key}")] * bool(key)
+        with (
+            pytest.raises(InvalidStatus) as refused,
+            connect(url, origin=Origin(GAME), subprotocols=others, proxy=None),
+        ):
+            pass
+        assert refused.value.response.status_code == 401
 
 
 @pytest.mark.parametrize(

@@ -215,20 +215,6 @@ def test_a_removed_version_is_reported(client: TestClient, registry: Registry) -
     assert act_with_state(client, None)["version"] == 2, "a new episode starts"
 
 
-@pytest.mark.parametrize("change", [lambda text: text[:-4], lambda text: "B" + text[1:], lambda text: text + "AAAA"])
-def test_a_damaged_token_is_rejected(read_only_client: TestClient, change: Any) -> None:
-    state = act_with_state(read_only_client, None)["state"]
-    error = rejected(read_only_client, {"observation": [1], "state": change(state)}, model="memory")
-    assert (error["code"], "not a complete token" in error["message"]) == ("invalid_state", True)
-
-
-def test_a_token_of_another_policy_is_rejected(read_only_client: TestClient) -> None:
-    state = act_with_state(read_only_client, None)["state"]
-    for model, observation in (("board", BOARD), ("empty", BOARD), ("duo.left", BOARD)):
-        error = rejected(read_only_client, {"observation": observation, "state": state}, model=model)
-        assert (error["code"], f"expected {model}" in error["message"]) == ("invalid_state", True)
-
-
 def test_a_token_of_a_republished_version_is_rejected(client: TestClient, tmp_path: Path) -> None:
     elsewhere = build_everything(Storage.at(tmp_path / "elsewhere"))
     elsewhere.close()

@@ -78,7 +78,7 @@ def test_invalid_requests_are_rejected(document: dict[str, Any], error: type[Lea
 
 def test_an_unknown_key_is_rejected() -> None:
     reject_unknown_keys({"observation": 1, "state": None}, KEYS)
-    with pytest.raises(InvalidInput, match="unknown key 'proabilities', expected explore, observation"):
+    with pytest.raises(InvalidInput, match="unknown key 'proabilities', expected analysis, deadline_ms, explore"):
         reject_unknown_keys({"observation": 1, "proabilities": True}, KEYS)
 
 

@@ -463,7 +463,6 @@ def test_a_persistent_queue_is_shed(
     ("fault", "code", "status"), [(MemoryError("no room"), "internal_error", 500), (LeagueError("so"), "error", 500)]
 )
 def test_an_internal_error_does_not_end_the_stream(
-    server: Replica,
     patchable_client: TestClient,
     monkeypatch: pytest.MonkeyPatch,
     fault: Exception,
@@ -474,9 +473,8 @@ def test_an_internal_error_does_not_end_the_stream(
         raise fault
 
     with open_stream(patchable_client) as stream:
-        champion = server.alias_slots.champion("board")
-        assert champion is not None
-        monkeypatch.setattr(champion.policies["shared"].inline_policy, "act", fail)
+        # Not of one policy: a replica that is slow for a moment runs another.
+        monkeypatch.setattr(OnnxPolicy, "act", fail)
         error = send(stream, BODY)
         assert (error["status"], "no room" in error["message"]) == (status, False)
         monkeypatch.undo()

@@ -15,7 +15,6 @@ from league.refs import RemoteRef, parse_ref
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import Box, Discrete
-from serve_app.access.access_control import RequestHeaders
 from tests.support.clients.protocol_observations import observations, policy_of
 from tests.support.servers.protocol_servers import Address, InProcess
 from training.sampling.opponents import OpponentPolicy, Opponents
@@ -47,13 +46,14 @@ def test_a_key_is_sent_only_to_the_server_that_it_is_for(
     replica: InProcess, leagues: Storage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     received = list[str | None]()
-    admit = replica.server.access.admit_request
+    admit = replica.server.access.admission
 
-    def record(scope: Any, need: Any, headers: RequestHeaders) -> Any:
-        received.append(None if headers.token is None else headers.token.decode())
-        return admit(scope, need, headers)
+    def record(scope: Any, path: str) -> Any:
+        admission = admit(scope, path)
+        received.append(None if admission.headers.token is None else admission.headers.token.decode())
+        return admission
 
-    monkeypatch.setattr(replica.server.access, "admit_request", record)
+    monkeypatch.setattr(replica.server.access, "admission", record)
     host = replica.http.partition(":")[2]
     interface = interface_of(leagues, "board")
     for variable, sent in (

@@ -1,10 +1,9 @@
 """REST without a client library: exact documents of the protocol, and invalid bodies."""
 
-import asyncio
 import gzip
 import json
 import zlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -17,13 +16,11 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
 from league.errors import StorageError
-from league.registry.registry import Registry
 from league.registry.versions import VersionRepository
 from league.settings import Storage
-from serve_app.app import Replica
 from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.protocol_servers import SETTINGS
-from tests.support.servers.replicas import LOCALHOST, QUICK
+from tests.support.servers.replicas import QUICK
 from tests.support.servers.replicas import replica as application
 from tests.support.waiting import until
 
@@ -392,29 +389,6 @@ def test_a_large_body_is_rejected(client: TestClient) -> None:
     assert "larger than" in error_of(infer(client, b" " * (SETTINGS.max_body + 1)), 413)
     in_parts = (b" " * 2**16 for _ in range(SETTINGS.max_body // 2**16 + 1))
     assert "larger than" in error_of(client.post("/v2/models/vector/infer", content=in_parts), 413)
-
-
-@pytest.mark.anyio
-async def test_the_number_of_concurrent_requests_is_limited(leagues: Storage) -> None:
-    server = Replica(Registry.open(leagues), SETTINGS.model_copy(update={"max_in_flight": 2}), "replica-1")
-    resume = asyncio.Event()
-
-    async def body() -> AsyncIterator[bytes]:
-        await resume.wait()
-        yield json.dumps({"inputs": [VECTOR]}).encode()
-
-    path = "/v2/models/vector/infer"
-    transport = httpx.ASGITransport(server.application())
-    async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
-        slow = [asyncio.create_task(client.post(path, content=body())) for _ in range(2)]
-        while server.inference.in_flight < 2:
-            await asyncio.sleep(0)
-        reply = await client.post(path, json={"inputs": [VECTOR]})
-        error_of(reply, 429)
-        assert reply.headers["retry-after"] == "1"
-        resume.set()
-        assert [(await each).status_code for each in slow] == [200, 200]
-        assert (await client.post(path, json={"inputs": [VECTOR]})).status_code == 200
 
 
 def test_metadata_without_a_database_lists_the_loaded_versions(

@@ -15,7 +15,7 @@ from league.errors import InvalidInput
 from league.policies.loading import load
 from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
-from league.registry.storage.mixture import Mixture
+from league.registry.storage.manifest import Mixture
 from league.registry.storage.rows import Portion
 from league.settings import Storage
 from policy_league_client.endpoint import Endpoint

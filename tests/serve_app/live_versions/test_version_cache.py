@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from league.errors import ArtifactCorrupt, Overloaded, StorageError
-from league.registry.storage.mixture import Member, Mixture
+from league.registry.storage.manifest import Member, Mixture
 from league.registry.storage.rows import VersionState
 from serve_app.live_versions.version_cache import MAX_REQUESTED, LoadedVersion, VersionCache
 

@@ -8,7 +8,7 @@ from threading import Event
 import pytest
 
 from league.settings import Storage
-from serve_app.observability.disk_space import DiskSpace
+from serve_app.observability.metrics_reporter import DiskSpace
 from tests.support.waiting import until
 
 

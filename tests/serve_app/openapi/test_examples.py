@@ -9,8 +9,8 @@ from starlette.testclient import TestClient
 
 from league.settings import Storage
 from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
-from serve_app.codecs.observation_codec import ObservationReader
-from serve_app.openapi.examples import observation
+from league.spaces.observation_codec import ObservationReader
+from serve_app.openapi.document import observation
 from tests.support.leagues.protocol_leagues import every_kind
 from tests.support.servers.replicas import QUICK, replica
 

@@ -293,7 +293,20 @@ class TestUvicorn:
     @pytest.mark.parametrize(
         ("ours", "base", "used"),
         [
-            (uvicorn_http.HttpProtocol, HttpToolsProtocol, {"shutdown", "connection_made"}),
+            (
+                uvicorn_http.HttpProtocol,
+                HttpToolsProtocol,
+                {
+                    "shutdown",
+                    "connection_made",
+                    "data_received",
+                    "on_message_begin",
+                    "on_headers_complete",
+                    "on_body",
+                    "on_message_complete",
+                    "on_response_complete",
+                },
+            ),
             (
                 uvicorn_websocket.StreamWebSocketProtocol,
                 WebSocketsSansIOProtocol,
@@ -508,3 +521,13 @@ def test_a_replica_knows_that_it_is_being_stopped(monkeypatch: pytest.MonkeyPatc
     assert not ray_serve.is_draining()
     actor._replica_impl._shutting_down = True
     assert ray_serve.is_draining()
+
+
+def test_a_replica_knows_its_own_url(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "self._http_port: Optional[int] = None" in inspect.getsource(replica.Replica)
+    actor = SimpleNamespace(_replica_impl=SimpleNamespace(_http_port=None))
+    monkeypatch.setitem(global_worker.actors, "actor", actor)
+    assert ray_serve.own_url("0.0.0.0") == ""
+    actor._replica_impl._http_port = 30_001
+    assert ray_serve.own_url("0.0.0.0") == "http://127.0.0.1:30001"
+    assert ray_serve.own_url("10.0.0.7") == "http://10.0.0.7:30001"

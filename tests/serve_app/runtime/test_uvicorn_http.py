@@ -135,7 +135,8 @@ def test_a_connection_that_the_client_resets_is_forgotten(loop: str) -> None:
         client = socket.create_connection(address)
         client.sendall(KEEP_ALIVE)
         answered(client)
-        connections = [item for item in gc.get_objects() if isinstance(item, HttpProtocol)]
+        port = client.getsockname()
+        connections = [item for item in gc.get_objects() if isinstance(item, HttpProtocol) and item.client == port]
         assert len(connections) == 1
         forgotten = weakref.ref(connections.pop())
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

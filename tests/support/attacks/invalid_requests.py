@@ -12,6 +12,7 @@ from base64 import b64encode
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -25,7 +26,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from benchmarks.harness import Target
-from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES, served
+from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES
 from serve_app.inference.stream_codec import encode_request as message_of
 from tests.support.servers.processes import replica_processes
 
@@ -54,10 +55,10 @@ Request = tuple[str, bytes, dict[str, str]]
 """Path, body, headers."""
 
 
-def invalid_requests(bodies: int, number: int = 0) -> Iterator[Target]:
-    """Send all bodies to one replica. number: seed."""
-    with served(2, replicas=1) as (url, registry), httpx.Client(base_url=url, timeout=30) as client:
-        (replica,) = replica_processes(registry.storage.home)
+def invalid_requests(url: str, home: Path, bodies: int, number: int = 0) -> Iterator[Target]:
+    """Send all bodies to a server with one replica and two versions. home: its LEAGUE_HOME; number: seed."""
+    with httpx.Client(base_url=url, timeout=30) as client:
+        (replica,) = replica_processes(home)
         statuses: Counter[str] = Counter()
         _warm_up(client, statuses, bodies // 10, number)
         before = replica.memory_info().rss
@@ -133,7 +134,10 @@ def _send(
     client: httpx.Client, statuses: Counter[str], method: str, url: str, body: bytes | None, headers: dict[str, str]
 ) -> None:
     try:
-        statuses[str(client.request(method, url, content=body, headers=headers).status_code)] += 1
+        with client.stream(method, url, content=body, headers=headers) as response:
+            statuses[str(response.status_code)] += 1
+            if not response.headers.get("content-type", "").startswith("text/event-stream"):  # which does not end
+                response.read()
     except (httpx.InvalidURL, httpx.LocalProtocolError, UnicodeError):
         statuses["not sent"] += 1
     except httpx.TransportError:

@@ -34,6 +34,7 @@ from tests.support.leagues.judged_league import CONFIG
 
 registry = Registry.open(Storage(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3])))
 print("ready", flush=True)
+sys.stdin.readline()
 while True:
     try:
         nightly(CONFIG, registry=registry)
@@ -77,16 +78,20 @@ def _league(home: Path, database_url: str) -> Registry:
 
 def _undisturbed(registry: Registry) -> list[tuple[object, ...]]:
     with ExitStack() as stack:
-        assert _run(stack, registry).wait(DEADLINE) == 0
+        run = _run(stack, registry)
+        _begin(run)
+        assert run.wait(DEADLINE) == 0
     return _state(registry)
 
 
 def _disturbed(registry: Registry, delay: float) -> tuple[int, list[tuple[object, ...]]]:
     """The number of rows that the first run added after it had lost its lock, and the final state."""
     with ExitStack() as stack:
-        first = _run(stack, registry)
+        # Both have imported their modules before the first begins: it would end while the second imports them.
+        first, second = _run(stack, registry), _run(stack, registry)
+        _begin(first)
         until(lambda: _counts(registry)["matches"] > 0, DEADLINE)
-        second = _run(stack, registry)
+        _begin(second)
         time.sleep(delay)
         with registry.database.write() as session:
             session.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({HOLDERS}) AS holders"))
@@ -103,12 +108,18 @@ def _disturbed(registry: Registry, delay: float) -> tuple[int, list[tuple[object
 def _run(stack: ExitStack, registry: Registry) -> subprocess.Popen[str]:
     storage = registry.storage
     command = [sys.executable, "-c", RUN, str(storage.home), storage.database_url, str(storage.artifacts)]
-    quiet = {"stderr": subprocess.DEVNULL, "stdout": subprocess.PIPE}
+    quiet = {"stderr": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stdin": subprocess.PIPE}
     run = stack.enter_context(subprocess.Popen(command, cwd=ROOT, text=True, **quiet))
     stack.callback(run.kill)
     assert run.stdout is not None
     run.stdout.readline()
     return run
+
+
+def _begin(run: subprocess.Popen[str]) -> None:
+    assert run.stdin is not None
+    run.stdin.write("\n")
+    run.stdin.flush()
 
 
 def _state(registry: Registry) -> list[tuple[object, ...]]:

@@ -87,9 +87,9 @@ class Load:
 
 @contextmanager
 def serving(cluster: LeagueCluster) -> Iterator[str]:
-    """Serve on all nodes; yields an API key."""
-    scopes = ("--scope", "act", "--scope", "read", "--scope", "evaluate")
-    token = json.loads(cluster.league(cluster.head, "keys", "create", "clients", *scopes, "--json"))["key"]
+    """Serve on all nodes; yields a new API key."""
+    scopes, name = ("--scope", "act", "--scope", "read", "--scope", "evaluate"), f"clients-{time.time_ns()}"
+    token = json.loads(cluster.league(cluster.head, "keys", "create", name, *scopes, "--json"))["key"]
     options = ("--host", "0.0.0.0", "--replicas", str(REPLICAS), "--address", cluster.address)
     before = len(cluster.head.log.read_text())
     server = cluster.start_league(cluster.head, "serve", *options)

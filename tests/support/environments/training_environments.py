@@ -99,6 +99,25 @@ def bits() -> ParallelEnv:
     return Guessing(spaces.Discrete(2), spaces.MultiBinary(2), lambda *_: 0.0)
 
 
+class Watching(Guessing):
+    """Two agents see a number each, and get the number that the other one sees, whatever they do."""
+
+    def __init__(self) -> None:
+        super().__init__(spaces.Discrete(3), spaces.Discrete(2), lambda *_: 0.0, agents=2)
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        first, second = (float(self._task[agent]) for agent in self.possible_agents)
+        observations, _, *flags = super().step(actions)
+        return observations, {"player_0": second, "player_1": first}, *flags
+
+    def state(self) -> np.ndarray:
+        return np.array([self._task[agent] for agent in self.possible_agents], np.float32)
+
+
+def watching() -> ParallelEnv:
+    return Watching()
+
+
 class Remembering(ParallelEnv):
     """A bit is shown once and must be named two steps later, without a hint. Best return: 1; without memory: 0, as a
     wrong answer costs as much as a right one earns.

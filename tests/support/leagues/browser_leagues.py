@@ -15,17 +15,21 @@ from league.environments.building import interface
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, RunPoint, StrengthRow, VerdictRow
+from league.search.policies import publish_search
 from tests.support.leagues import tictactoe
 from tests.support.leagues.reported_league import HOSTILE, league_after_nightly
 from tests.support.leagues.tictactoe import LEAGUE
+from tests.support.policies.graphs import masked_mlp
 from tests.support.waiting import until
 
 CONFIGS = Path(__file__).parents[3] / "policy_league/configs"
 CONNECT_FOUR, EMPTY = "connect_four", "two_step_game"
 TEAM, LONG = "team", "n" * 60 + "_" + "m" * 39
 """The two-step game, whose agents are a team, and tic-tac-toe with the longest name and the longest reason."""
-NAMED, HIDDEN, VIEWS = "named", "hidden", "views"
-"""Tic-tac-toe with names of actions, with pictures that show hidden information, and with one view per agent."""
+NAMED, HIDDEN, VIEWS, SEARCHED = "named", "hidden", "views", "searched"
+"""Tic-tac-toe with names of actions, with pictures that show hidden information, with one view per agent, and with a
+version that searches."""
+SIMULATIONS = 40
 DIRECTIONS = ["up-left", "left", "down-left", "up", "centre", "down", "up-right", "right", "down-right"]
 RUN = "ppo-17"
 KEYS = {"everything": ["act", "read", "evaluate", "promote"], "evaluator": ["evaluate", "read"], "reader": ["read"]}
@@ -46,6 +50,7 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
             tictactoe.config(league=HIDDEN, environment=hidden),
             tictactoe.config(league=VIEWS, environment=views),
             tictactoe.config(league=LONG),
+            tictactoe.config(league=SEARCHED),
             LeagueConfig.load(CONFIGS / f"{EMPTY}.yaml").model_copy(update={"league": TEAM}),
         ):
             registry.leagues.register(config, interface(config))
@@ -53,6 +58,13 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
         tictactoe.publish(registry, tictactoe.graph(), LONG)
         registry.aliases.set(LONG, "champion", 1, expected=None, actor="a" * 100, reason="why " * 500)
         evaluate(LONG, [f"{LONG}@1", "script:random"], registry=registry, blocks=1)
+        value = masked_mlp((3, 3, 2), 9, has_value=True)
+        base, row = (
+            tictactoe.publish(registry, masked_mlp((3, 3, 2), 9), SEARCHED, value=value),
+            registry.leagues.get(SEARCHED),
+        )
+        publish_search(registry, base, row.config.environment, row.interface, "puct", SIMULATIONS)
+        evaluate(SEARCHED, [base.ref, "script:random"], registry=registry, blocks=1)
         evaluate(TEAM, ["script:random", "script:first"], registry=registry, blocks=2)
         registry.traffic.set(LEAGUE, canary=Portion(1, 0.05), shadow=Portion(2, 1.0), actor=HOSTILE, reason=HOSTILE)
         registry.versions.set_note(CheckpointRef(LEAGUE, 2), HOSTILE, actor=HOSTILE)
@@ -129,12 +141,12 @@ def verdict_between_versions(registry: Registry) -> VerdictRow:
 
 
 def answer(method: str, url: str, body: Any = None) -> Any:
-    """The response of the evaluation service; retries while it is not ready."""
+    """The response of the evaluation service; retries while it, or the server on a busy machine, is not ready."""
     replies: list[httpx.Response] = []
 
     def is_ready() -> bool:
         replies.append(httpx.request(method, url, json=body, timeout=60))
-        return replies[-1].status_code != 503
+        return replies[-1].status_code not in (503, 504)
 
-    until(is_ready, seconds=120)
+    until(is_ready, seconds=240)
     return replies[-1].raise_for_status().json()

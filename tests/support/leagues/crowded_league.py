@@ -16,7 +16,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
-from sqlalchemy import update
+from sqlalchemy import bindparam, update
 
 from benchmarks.harness import CONFIGS
 from benchmarks.leagues.served_league import builder
@@ -32,9 +32,8 @@ from league.registry.storage import rows, tables
 from league.registry.storage.database import insert
 from league.registry.storage.manifest import Manifest
 from league.registry.storage.rows import RunState
-from league.results.ledger import Ledger, row
+from league.results.ledger import Ledger
 from league.results.records import Game, Match, Schedule
-from league.results.scoring import admit
 from league.settings import Storage
 
 CONFIG = LeagueConfig.load(CONFIGS / "connect_four.yaml")
@@ -140,13 +139,14 @@ class _Crowd:
     def _write(self, matches: Sequence[Match], night: int, hour: int) -> None:
         if not matches:
             return
-        schedule = self._ledger.schedule(matches[0].schedule)
-        for match in matches:
-            admit(match, schedule)
-        began = self._evening(night) + timedelta(hours=hour)
-        rows = [row(match, began + timedelta(seconds=number)) for number, match in enumerate(matches)]
+        self._written += self._ledger.extend(matches)
+        began, table = self._evening(night) + timedelta(hours=hour), tables.MatchTable
+        dated = [{"at": began + timedelta(seconds=match.position), "place": match.position} for match in matches]
+        query = update(table.__table__).where(table.schedule == matches[0].schedule)  # type: ignore[arg-type]
         with self._registry.database.write() as session:
-            self._written += insert(session, tables.MatchTable, rows)
+            session.connection().execute(
+                query.where(table.position == bindparam("place")).values(played_at=bindparam("at")), dated
+            )
 
     def _date(self, verdict: str, night: int) -> None:
         """Set the dates of a verdict and its promotion to that night."""

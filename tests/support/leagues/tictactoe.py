@@ -55,13 +55,15 @@ def publish(
     exploits: str | None = None,
     source: str | None = None,
     settings: Mapping[str, object] | None = None,
+    value: bytes | None = None,
 ) -> VersionRow:
     """Publish a version with one graph for all policies of the league.
 
-    exploits: it is an exploiter of this version. source: by default a new one. settings: of its training.
+    exploits: it is an exploiter of this version. source: by default a new one. settings: of its training. value: the
+    second graph, with logits and value.
     """
     source = source or f"hand/{len(registry.versions.all(league))}"
-    build = _builder(registry.leagues.get(league), graph, exploits, dict(settings or {}))
+    build = _builder(registry.leagues.get(league), graph, exploits, dict(settings or {}), value)
     return registry.publisher.publish(league, build, source=source, parent=None)
 
 
@@ -197,12 +199,14 @@ def _model(
 
 
 def _builder(
-    row: LeagueRow, graph: bytes, exploits: str | None, settings: dict[str, object]
+    row: LeagueRow, graph: bytes, exploits: str | None, settings: dict[str, object], value: bytes | None
 ) -> Callable[[Path, int], Manifest]:
     def build(directory: Path, number: int) -> Manifest:
         policies = {}
         for name in row.interface.policy_ids:
             (directory / f"{name}.onnx").write_bytes(graph)
+            if value is not None:
+                (directory / f"{name}.value.onnx").write_bytes(value)
             spaces = row.interface.of_policy(name)
             policies[name] = PolicyManifest(
                 file=f"{name}.onnx",
@@ -212,6 +216,7 @@ def _builder(
                 outputs=_tensors(graph, "output"),
                 state=tuple(tensor for tensor in _tensors(graph, "input") if tensor.name.startswith("state_in_")),
                 parity=Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
+                value=None if value is None else f"{name}.value.onnx",
             )
         return Manifest(
             league=row.slug,

@@ -11,9 +11,18 @@ MASK = ("action_mask", TensorProto.INT8)
 
 
 def masked_mlp(
-    shape: Sequence[int] = (6, 7, 2), actions: int = 7, hidden: Sequence[int] = (16,), seed: int = 0, start: int = 0
+    shape: Sequence[int] = (6, 7, 2),
+    actions: int = 7,
+    hidden: Sequence[int] = (16,),
+    seed: int = 0,
+    start: int = 0,
+    *,
+    has_value: bool = False,
 ) -> bytes:
-    """Observation and mask (int8) to logits, -1e9 for illegal actions, and their arg max plus `start`."""
+    """Observation and mask (int8) to logits, -1e9 for illegal actions, and their arg max plus `start`.
+
+    has_value: whether there is a third output, `value`, from the last hidden layer.
+    """
     random, width, name = np.random.default_rng(seed), int(np.prod(shape)), "flat"
     nodes = [
         helper.make_node("Cast", ["observation"], ["cast"], to=TensorProto.FLOAT),
@@ -28,7 +37,7 @@ def masked_mlp(
         constants[f"w{i}"] = (random.normal(size=(width, units)) / np.sqrt(width)).astype(np.float32)
         nodes.append(helper.make_node("MatMul", [name, f"w{i}"], [f"z{i}"]))
         nodes.append(helper.make_node("Tanh", [f"z{i}"], [f"a{i}"]))
-        width, name = units, f"a{i}"
+        last_hidden, (width, name) = (width, name), (units, f"a{i}")
     nodes += [
         helper.make_node("Equal", ["action_mask", "zero"], ["illegal"]),
         helper.make_node("Where", ["illegal", "low", name], ["action_dist_inputs"]),
@@ -43,6 +52,11 @@ def masked_mlp(
         helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
         helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", actions]),
     ]
+    if has_value:
+        width, name = last_hidden
+        constants["wv"] = (random.normal(size=width) / np.sqrt(width)).astype(np.float32)
+        nodes += [helper.make_node("MatMul", [name, "wv"], ["zv"]), helper.make_node("Tanh", ["zv"], ["value"])]
+        outputs.append(helper.make_tensor_value_info("value", TensorProto.FLOAT, ["batch"]))
     return _serialized(nodes, inputs, outputs, constants)
 
 

@@ -14,7 +14,7 @@ from serve_app.runtime.uvicorn_http import HttpProtocol
 @contextmanager
 def serving(application: ASGIApp, loop: str) -> Iterator[tuple[str, int]]:
     """The address of a server in a thread that has ended afterwards. loop: uvicorn's name of the event loop."""
-    protocol = partial(HttpProtocol, lambda: None)
+    protocol = partial(HttpProtocol, lambda: None, None)
     config = uvicorn.Config(
         application,
         port=0,

@@ -5,7 +5,6 @@ from contextlib import contextmanager
 from uuid import uuid4
 
 import obstore
-from moto.server import ThreadedMotoServer
 from obstore.store import S3Store
 
 VARIABLES = {
@@ -19,6 +18,8 @@ VARIABLES = {
 @contextmanager
 def server(port: int = 0) -> Iterator[str]:
     """Run a server, by default on a free port; yields its URL. Its objects belong to this process and outlast it."""
+    from moto.server import ThreadedMotoServer  # tests of object stores only: importing it takes a second
+
     running = ThreadedMotoServer(ip_address="127.0.0.1", port=port, verbose=False)
     running.start()
     host, port = running.get_host_and_port()

@@ -13,4 +13,4 @@ OTHER = {"onnxruntime": "1.2.3"}
 def build_app(args: ServeSettings) -> Application:
     """As `serve_app.app:build_app`."""
     deployment = serve.deployment(serve.ingress()(PolicyServer))
-    return deployment.bind(args, None, installed_with_this() | OTHER)
+    return deployment.bind(args, None, None, installed_with_this() | OTHER)

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import uvicorn
@@ -14,6 +15,8 @@ from serve_app.app import Replica
 from serve_app.runtime import uvicorn_http, uvicorn_websocket
 from serve_app.runtime.serve_bypass import ServeBypass
 from serve_app.settings import ServeSettings
+from tests.support.leagues.served_leagues import BOARD, promote, publish, register
+from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.replicas import QUICK, UnavailableEvaluation
 from tests.support.waiting import until
 
@@ -57,3 +60,15 @@ def listening(
         runner.should_exit = True
         thread.join(20)
         assert not thread.is_alive()
+
+
+@contextmanager
+def connect_four_server(home: Path) -> Iterator[str]:
+    """The URL of a server whose league connect_four has a champion, as the examples of the documentation need."""
+    registry = Registry.open(Storage.at(home))
+    register(registry, "connect_four", {"shared": BOARD})
+    publish(registry, "connect_four", {"shared": masked_mlp()}, "run")
+    promote(registry, "connect_four", 1)
+    with listening(registry.storage) as listener:
+        yield listener.url
+    registry.close()

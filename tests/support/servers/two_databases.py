@@ -11,6 +11,7 @@ import httpx
 from sqlalchemy import select
 from starlette.testclient import TestClient
 
+from league.registry.keys import SCOPES
 from league.registry.registry import Registry
 from league.registry.storage.tables import ReplicaTable
 from league.settings import Storage
@@ -95,6 +96,6 @@ def _types(document: Any) -> Any:
 def _fill(storage: Storage) -> str:
     registry = build_everything(storage)
     record(registry)
-    _, token = registry.keys.create("databases", ["act", "read", "evaluate", "promote"])
+    _, token = registry.keys.create("databases", SCOPES)
     registry.close()
     return token

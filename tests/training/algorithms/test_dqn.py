@@ -1,6 +1,5 @@
 """DQN in this process: it learns, with each of its parts, and continues exactly from its checkpoint."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,15 +7,14 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN
 
-from league.config.league import LeagueConfig
 from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy
 from tests.support.environments.training_environments import ROUNDS
 from tests.support.leagues.training_leagues import solvable, solvable_by_dqn
+from tests.support.off_policy import build, learns, train
 from training.algorithms.off_policy import OffPolicy, starts_with_empty_replay
 from training.algorithms.rllib_config import algorithm_config, module_spec
 from training.export import parity
@@ -33,26 +31,6 @@ MEMORY = {"recurrence": {"width": 16, "sequence": 3}, "batch_size": 32}
 ALL_EXTENSIONS = {"n_step": 3, "priorities": {}, "noisy": True, "distributional": {"low": -1, "high": 5}}
 
 
-def build(league: LeagueConfig) -> OffPolicy:
-    algorithm = algorithm_config(league, interface(league)).build_algo()
-    algorithm.reset_episodes(0)
-    return algorithm
-
-
-def train(league: LeagueConfig, updates: int, inspect_algorithm: Callable[[OffPolicy, dict[str, Any]], Any]) -> Any:
-    algorithm = build(league)
-    try:
-        for _ in range(updates):
-            result = algorithm.train()
-        return inspect_algorithm(algorithm, result)
-    finally:
-        algorithm.stop()
-
-
-def returns(_: OffPolicy, result: dict[str, Any]) -> dict[str, float]:
-    return result[ENV_RUNNER_RESULTS][EPISODE_MODULE_RETURN_MEAN]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
@@ -60,22 +38,20 @@ def returns(_: OffPolicy, result: dict[str, Any]) -> dict[str, float]:
     ids=["plain", "single", "all extensions", "Polyak"],
 )
 def test_dqn_learns(settings: dict[str, Any]) -> None:
-    assert train(solvable_by_dqn("discrete", **settings), 9, returns)["shared"] > 0.9 * ROUNDS
+    assert learns(solvable_by_dqn("discrete", **settings), {"shared": 0.9 * ROUNDS}, 9)
 
 
 @pytest.mark.slow
 def test_independent_policies_learn_opposed_tasks() -> None:
     league = solvable_by_dqn("discrete", {"agents": 2, "opposed": True}, {"a": ["player_0"], "b": ["player_1"]})
-    means = train(league, 10, returns)
-    assert means["a"] > 0.85 * ROUNDS
-    assert means["b"] > -0.15 * ROUNDS
+    assert learns(league, {"a": 0.85 * ROUNDS, "b": -0.15 * ROUNDS}, 10)
 
 
 @pytest.mark.slow
 def test_remembering_requires_recurrence() -> None:
     settings = {"gamma": 0.99, "num_envs": 8, "exploration": {"steps": 8000}}
-    assert train(solvable_by_dqn("remembering", **settings, **MEMORY), 14, returns)["shared"] > 0.8
-    assert train(solvable_by_dqn("remembering", **settings), 14, returns)["shared"] < 0.5
+    assert learns(solvable_by_dqn("remembering", **settings, **MEMORY), {"shared": 0.8}, 14)
+    assert not learns(solvable_by_dqn("remembering", **settings), {"shared": 0.5}, 14)
 
 
 def test_rows_after_the_end_of_an_episode_do_not_count() -> None:

@@ -1,5 +1,6 @@
 """The candidates of a run, its scores against them, and the draws."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, Manifest
 from league.results.ledger import Ledger
 from league.results.payoffs import PRIOR_GAMES, payoff_matrix
-from league.results.records import BlockResult
+from league.results.records import Outcome
+from league.results.sums import GameSums, PairSums
 from league.settings import Storage
 from tests.support.leagues import registries
 from training.algorithms.league_opponents import HALF_LIFE, LeagueOpponents
@@ -82,6 +84,16 @@ def test_of_a_mixture_the_members_are_candidates(registry: Registry) -> None:
     opponents = opponents_of(registry, window=2)
     opponents.refresh()
     assert opponents.candidates == tuple(f"tictactoe@{number}" for number in (1, 3, 5, 6))
+
+
+def test_a_search_version_is_no_candidate_but_what_it_plays_is(registry: Registry) -> None:
+    for number in range(3):
+        registries.publish(registry, f"run/{number}")
+    number = registry.publisher.publish_search("tictactoe", 1, "puct", 8, 1.0).number
+    registry.aliases.set("tictactoe", "champion", number, expected=ANY, actor="me", reason="test")
+    opponents = opponents_of(registry, window=1)
+    opponents.refresh()
+    assert opponents.candidates == ("tictactoe@1", "tictactoe@3")
 
 
 def test_the_newest_exploiters_of_champions_are_candidates(registry: Registry) -> None:
@@ -190,8 +202,8 @@ def test_removed_versions_are_not_drawn_after_resuming(registry: Registry) -> No
 def test_the_prior_is_the_parents_score_in_the_league(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in range(2):
         registries.publish(registry, f"run/{number}")
-    block = BlockResult("schedule", 0, ("tictactoe@1", "tictactoe@2"), 30, (6.0, 24.0), None)
-    monkeypatch.setattr(Ledger, "results", lambda *_: [block])
+    sums = PairSums(matches=1, whole=GameSums(Counter({(30, 12, 48): 1})))
+    monkeypatch.setattr(Ledger, "sums", lambda *_: {("tictactoe@1", "tictactoe@2"): sums})
     opponents = opponents_of(registry)
     opponents.refresh(parent=2)
     parents_score = (24 + PRIOR_GAMES / 2) / (30 + PRIOR_GAMES)
@@ -226,7 +238,7 @@ def test_a_run_from_a_version_counts_its_own_episodes(registry: Registry) -> Non
 
 
 def test_the_payoff_matrix_has_matches_and_training_games() -> None:
-    blocks = [BlockResult("schedule", i, ("a", "b"), 2, (2.0, 0.0), None) for i in range(5)]
+    blocks = [Outcome(("a", "b"), 2, (2.0, 0.0), matches=5)]
     found = payoff_matrix(("a", "b", "c"), blocks, {"c": {"b": (10.0, 10.0), "unknown": (5.0, 5.0)}})
     score = (10 + PRIOR_GAMES / 2) / (10 + PRIOR_GAMES)
     np.testing.assert_allclose(found, [[0.5, score, 0.5], [1 - score, 0.5, 1 - score], [0.5, score, 0.5]])

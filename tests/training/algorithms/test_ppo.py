@@ -7,18 +7,31 @@ import pytest
 import ray
 import torch
 from ray.exceptions import RayActorError
-from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN, NUM_ENV_STEPS_SAMPLED
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.core.columns import Columns
+from ray.rllib.utils.metrics import (
+    ENV_RUNNER_RESULTS,
+    EPISODE_MODULE_RETURN_MEAN,
+    LEARNER_RESULTS,
+    NUM_ENV_STEPS_SAMPLED,
+)
 
 from league.config.league import LeagueConfig
+from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from league.errors import ConfigError
 from tests.support.environments.training_environments import ROUNDS
 from tests.support.leagues.training_leagues import counting, solvable, tictactoe
-from training.algorithms.ppo import PPO, algorithm_config, module_spec
+from tests.support.waiting import until
+from training.algorithms.ppo import PPO
+from training.algorithms.rllib_config import algorithm_config, module_spec
+from training.learners.ppo import TEACHER_LOSS, TEACHER_WEIGHT
 from training.sampling.env_runner import module_spaces
+from training.sampling.episode_chunks import EpisodeChunks
 
 TWO: dict[str, Any] = {"kwargs": {"agents": 2, "opposed": True}, "policies": {"a": ["player_0"], "b": ["player_1"]}}
 MEMORY = {"recurrence": {"width": 16, "sequence": 8}}
+SMALL: dict[str, Any] = {"train_batch_size": 64, "minibatch_size": 64, "epochs": 1}
 UPDATES = 40
 
 
@@ -78,17 +91,100 @@ def test_it_does_not_learn_without_the_required_setting(name: str, below: float)
 @pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_a_slow_runner_is_waited_for_and_a_lost_one_ends_training() -> None:
-    league = tictactoe(runners=1, train_batch_size=64, minibatch_size=64, epochs=1)
+    league = tictactoe(runners=1, **SMALL)
     config = algorithm_config(league, interface(league)).env_runners(sample_timeout_s=0.001)  # RLlib's: one minute
     algorithm = config.build_algo()
     try:
         assert algorithm.train()[ENV_RUNNER_RESULTS][NUM_ENV_STEPS_SAMPLED] >= 64
         (runner,) = algorithm.env_runner_group._worker_manager._actors.values()
+        algorithm.reset_episodes(64)
         ray.kill(runner)
         with pytest.raises(RayActorError):
             algorithm.train()
     finally:
         algorithm.stop()
+
+
+@pytest.mark.usefixtures("ray_session")
+def is_lost(runner: Any) -> bool:
+    try:
+        ray.get(runner.ping.remote())
+    except RayActorError:
+        return True
+    return False
+
+
+def test_a_runner_lost_before_a_checkpoint_ends_training() -> None:
+    """Its sample in flight is not needed, but the runner is."""
+    algorithm = build(tictactoe(runners=1, **SMALL))
+    try:
+        algorithm.train()
+        (runner,) = algorithm.env_runner_group._worker_manager._actors.values()
+        ray.kill(runner)
+        until(lambda: is_lost(runner))  # it may answer for a moment
+        with pytest.raises(RayActorError):
+            algorithm.reset_episodes(64)
+    finally:
+        algorithm.stop()
+
+
+class Recording(PPO):
+    """Keeps each update's sample, and the weights before the first update and after each."""
+
+    def setup(self, config: AlgorithmConfig) -> None:
+        super().setup(config)
+        self.samples: list[list[EpisodeChunks]] = []
+        self.weights = [self.get_module("shared").get_state()]
+
+    def sample_train_batch(self) -> tuple[list[EpisodeChunks], list[dict[str, Any]]]:
+        chunks, metrics = super().sample_train_batch()
+        self.samples.append(chunks)
+        return chunks, metrics
+
+    def training_step(self) -> None:
+        super().training_step()
+        self.weights.append(self.get_module("shared").get_state())
+
+
+def recorded(league: LeagueConfig, updates: int) -> Recording:
+    algorithm = Recording(config=algorithm_config(league, interface(league)))
+    try:
+        algorithm.reset_episodes(0)
+        for _ in range(updates):
+            algorithm.train()
+    finally:
+        algorithm.stop()
+    return algorithm
+
+
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize(("lag", "runners", "effective"), [(0, 2, 0), (1, 2, 1), (2, 1, 2), (1, 0, 0)])
+def test_a_sample_is_from_the_weights_of_a_fixed_earlier_update(lag: int, runners: int, effective: int) -> None:
+    """Except for actions whose results the sample before did not contain."""
+    algorithm = recorded(tictactoe(runners=runners, lag=lag, **SMALL), updates=5)
+    module = algorithm.config.get_multi_rl_module_spec(spaces=algorithm.spaces).build()["shared"]
+
+    def difference(weights: dict[str, np.ndarray], chunks: EpisodeChunks) -> float:
+        module.set_state(weights)
+        acted = np.delete(np.arange(len(chunks.actions) + len(chunks.lengths)), np.cumsum(chunks.lengths + 1) - 1)
+        observations = {name: torch.from_numpy(value[acted]) for name, value in chunks.observations.items()}
+        outputs = module.forward_inference({Columns.OBS: observations})[Columns.ACTION_DIST_INPUTS]
+        return float(np.median(np.abs(outputs.detach().numpy() - chunks.dist_inputs)))
+
+    for update, sample in enumerate(algorithm.samples):
+        for chunks in sample:
+            differences = [difference(weights, chunks) for weights in algorithm.weights]
+            assert np.argmin(differences) == max(update - effective, 0)
+            assert min(differences) < 1e-6 < np.partition(differences, 1)[1]
+
+
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize("critic", ["own", "central"])
+def test_equal_seeds_give_equal_weights_while_runners_and_learner_overlap(critic: str) -> None:
+    first, second = (recorded(tictactoe(runners=2, critic=critic, **SMALL), updates=4) for _ in range(2))
+    for one, other in zip(first.weights, second.weights, strict=True):
+        assert all(np.array_equal(value, other[name]) for name, value in one.items())
+    assert any(not np.array_equal(value, first.weights[-1][name]) for name, value in first.weights[0].items())
 
 
 @pytest.mark.usefixtures("ray_session")
@@ -110,6 +206,27 @@ def test_phases_follow_the_updates_after_restoring(tmp_path: Any) -> None:
     assert changed == [{"a"}, {"b"}, {"b"}, {"a"}, {"b"}, {"b"}, {"a"}]
 
 
+@pytest.mark.usefixtures("ray_session")
+def test_the_teacher_acts_in_all_runners_while_its_weight_is_not_zero() -> None:
+    """And only on the steps of policies that learn."""
+    weight = {"initial": 0.5, "final": 0.0, "steps": 100}
+    settings = {"teacher": {"ref": "script:first", "weight": weight}, "policies_to_train": ["b"], "runners": 2}
+    league = solvable("discrete", **TWO, **settings, train_batch_size=256)
+    algorithm = build(league)
+    try:
+        chunks, _ = algorithm.sample_train_batch()
+        runners = {(part.name.split("-")[0], part.policy): part.taught is not None for part in chunks}
+        assert runners == {("0", "a"): False, ("0", "b"): True, ("1", "a"): False, ("1", "b"): True}
+        results = []
+        for steps in (50, 100):
+            algorithm.progress = ScheduleProgress(steps, 0.0)
+            results.append(algorithm.train()[LEARNER_RESULTS]["b"])
+    finally:
+        algorithm.stop()
+    assert [result[TEACHER_WEIGHT] for result in results] == pytest.approx([0.25, 0])
+    assert [np.isfinite(result.get(TEACHER_LOSS, np.nan)) for result in results] == [True, False]
+
+
 def changed_policies(algorithm: PPO) -> set[str]:
     """The policies whose weights change in an update, which must be the same in the learner and in the runner."""
 
@@ -125,9 +242,14 @@ def changed_policies(algorithm: PPO) -> set[str]:
 
 
 @pytest.mark.usefixtures("ray_session")
-def test_a_restored_algorithm_continues_identically(tmp_path: Any) -> None:
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("remembering", MEMORY), ("watching", {"critic": "central", "normalize_values": True})],
+    ids=["memory", "central critic"],
+)
+def test_a_restored_algorithm_continues_identically(name: str, options: dict[str, Any], tmp_path: Any) -> None:
     """Compares an algorithm that continues after its checkpoint with a restored one."""
-    league = solvable("remembering", **MEMORY, train_batch_size=128)
+    league = solvable(name, **options, train_batch_size=128)
     algorithm, weights = build(league), []
     try:
         algorithm.train()
@@ -168,6 +290,12 @@ def test_settings_for_unknown_policies_are_rejected() -> None:
         league = tictactoe(**settings)
         with pytest.raises(ConfigError, match=r"unknown policy"):
             algorithm_config(league, interface(league))
+
+
+def test_a_central_critic_of_a_single_agent_is_rejected() -> None:
+    league = solvable("discrete", critic="central")
+    with pytest.raises(ConfigError, match=r"training\.critic: central needs several agents"):
+        algorithm_config(league, interface(league))
 
 
 def test_unsupported_spaces_are_rejected_with_the_name_of_the_policy() -> None:

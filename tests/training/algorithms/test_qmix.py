@@ -1,6 +1,5 @@
 """QMIX in this process: it solves what a sum of values cannot represent, and continues exactly from its checkpoint."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN, LEARNER_RESULTS
+from ray.rllib.utils.metrics import LEARNER_RESULTS
 
 from benchmarks.training import two_step
 from league.config.league import LeagueConfig
@@ -17,6 +16,7 @@ from league.errors import ConfigError
 from league.policies.onnx import OnnxPolicy
 from tests.support.environments.training_environments import ROUNDS
 from tests.support.leagues.training_leagues import solvable_by_dqn
+from tests.support.off_policy import build, learns, train
 from training.algorithms.off_policy import OffPolicy
 from training.algorithms.rllib_config import algorithm_config, module_spec
 from training.export import parity
@@ -29,33 +29,12 @@ from training.sampling.closed_transitions import JOINT, PRESENT, STATE, TERMINAT
 
 pytestmark = pytest.mark.usefixtures("ray_session")
 MEMORY = {"recurrence": {"width": 16, "sequence": 3}, "batch_size": 32, "hidden": [16]}
-Inspect = Callable[[OffPolicy, dict[str, Any]], Any]
 
 
 def qmix_league(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
     """An environment of `tests.support.environments.training_environments`, with all agents in one team."""
     settings = {"algorithm": "qmix", "groups": {"team": ["*"]}, "mixing_width": 8}
     return solvable_by_dqn(name, kwargs, policies, **(settings | training))
-
-
-def build(league: LeagueConfig) -> OffPolicy:
-    algorithm = algorithm_config(league, interface(league)).build_algo()
-    algorithm.reset_episodes(0)
-    return algorithm
-
-
-def train(league: LeagueConfig, updates: int, inspect_algorithm: Inspect) -> Any:
-    algorithm = build(league)
-    try:
-        for _ in range(updates):
-            result = algorithm.train()
-        return inspect_algorithm(algorithm, result)
-    finally:
-        algorithm.stop()
-
-
-def returns(_: OffPolicy, result: dict[str, Any]) -> dict[str, float]:
-    return result[ENV_RUNNER_RESULTS][EPISODE_MODULE_RETURN_MEAN]
 
 
 @pytest.mark.slow
@@ -79,24 +58,22 @@ def test_additive_and_independent_values_choose_the_safe_game(mixer: str) -> Non
 @pytest.mark.parametrize("mixer", ["qmix", "vdn", "none"])
 def test_agents_of_a_team_with_separate_networks_learn(mixer: str) -> None:
     policies = {"a": ["player_0"], "b": ["player_1"]}
-    means = train(qmix_league("discrete", {"agents": 2}, policies, mixer=mixer), 14, returns)
-    assert min(means.values()) > 0.85 * ROUNDS
+    league = qmix_league("discrete", {"agents": 2}, policies, mixer=mixer)
+    assert learns(league, dict.fromkeys(policies, 0.85 * ROUNDS), 14)
 
 
 @pytest.mark.slow
 def test_competing_teams_learn_opposed_tasks() -> None:
     groups = {"one": ["player_0"], "other": ["player_1", "player_2"]}
     league = qmix_league("discrete", {"agents": 3, "opposed": True}, {"a": ["player_0"], "b": ["*"]}, groups=groups)
-    means = train(league, 14, returns)
-    assert means["a"] > 0.85 * ROUNDS
-    assert means["b"] > -0.15 * ROUNDS
+    assert learns(league, {"a": 0.85 * ROUNDS, "b": -0.15 * ROUNDS}, 14)
 
 
 @pytest.mark.slow
 def test_remembering_requires_recurrence() -> None:
     settings = {"gamma": 0.99, "num_envs": 8, "exploration": {"steps": 8000}}
-    assert train(qmix_league("remembering", **settings, **MEMORY), 14, returns)["shared"] > 0.8
-    assert train(qmix_league("remembering", **settings), 14, returns)["shared"] < 0.5
+    assert learns(qmix_league("remembering", **settings, **MEMORY), {"shared": 0.8}, 14)
+    assert not learns(qmix_league("remembering", **settings), {"shared": 0.5}, 14)
 
 
 def test_the_recurrent_state_has_the_drawn_actions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,13 +1,23 @@
+import json
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from league.config.algorithms import GROUP, IMPORTED, OwnSettings
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from policy_league.configs import bundled
 from tests.support.leagues.training_leagues import counting, tictactoe
-from training.algorithms.rllib_config import check_opponents, check_policies_to_train, learning_policies, num_envs
+from training.algorithms.rllib_config import (
+    algorithm_config,
+    check_opponents,
+    check_policies_to_train,
+    learning_policies,
+    with_algorithm,
+)
 from training.runs.train import check
 
 POLICIES = ("a", "b", "c")
@@ -43,26 +53,6 @@ def test_policies_with_a_shared_encoder_must_learn_together(policies: Any) -> No
     check_policies_to_train(training_with_policies(None, shared_encoder=True), POLICIES)
 
 
-@pytest.mark.parametrize(
-    ("training", "expected"),
-    [
-        ({"train_batch_size": 4096}, 128),
-        ({"train_batch_size": 4096, "runners": 2}, 64),
-        ({"train_batch_size": 512}, 32),
-        ({"train_batch_size": 65536}, 512),
-        ({"train_batch_size": 4096, "num_envs": 7}, 7),
-        ({"algorithm": "dqn"}, 32),
-    ],
-    ids=["batch", "runners", "small batch", "large batch", "number", "replay buffer"],
-)
-def test_each_agent_gets_enough_steps_of_each_vectorised_environment(training: dict[str, Any], expected: int) -> None:
-    assert num_envs(tictactoe(**{"num_envs": "auto"} | training), agents=2) == expected
-
-
-def test_a_stock_environment_has_the_same_number_for_every_batch() -> None:
-    assert num_envs(counting([4, 6], [1], num_envs="auto", train_batch_size=65536), agents=2) == 32
-
-
 def test_opponents_are_not_drawn_by_scores_that_games_do_not_have() -> None:
     league = counting([3, 4, 5], [1], opponents={"league": {"sampling": "pfsp"}})
     with pytest.raises(ConfigError, match=r"^training\.opponents\.league\.sampling: pfsp needs scores.*3 sides"):
@@ -84,3 +74,86 @@ def test_bundled_configurations_use_the_fast_seeds_of_their_environments(name: s
     league = LeagueConfig.load(bundled.find(name))
     assert league.training.seeds == "fast"
     check(league, interface(league))
+
+
+ALGORITHM = """
+from league.config.off_policy import OffPolicyConfig
+from league.config.ppo import PPOConfig
+from training.algorithms.off_policy import OffPolicy
+from training.algorithms.ppo import PPO
+
+class Settings(PPOConfig):
+    bonus: float = 1.0
+    gamma: float = 0.5
+
+class Bonus(PPO):
+    settings_class = Settings
+
+class Wrong(PPO):
+    settings_class = OffPolicyConfig
+
+class Empty(OffPolicy):
+    pass
+
+def function(): ...
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("league")
+    (folder / "algorithm_of_test.py").write_text(ALGORITHM)
+    return folder
+
+
+def with_own_algorithm(folder: Path, name: str, **settings: Any) -> LeagueConfig:
+    environment = {"entry_point": "pettingzoo.classic.tictactoe_v3"}
+    training = {"algorithm": f"algorithm_of_test:{name}"} | settings
+    return LeagueConfig.from_mapping(
+        {"league": "own", "folder": str(folder), "environment": environment, "training": training}
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("Bonu", {}, "has no 'Bonu', did you mean 'Bonus'?"),
+        ("function", {}, "algorithm_of_test:function: expected a subclass of PPO or OffPolicy"),
+        ("Wrong", {}, "settings_class: expected a subclass of PPOConfig, got <class 'league.config.off_policy"),
+        ("Empty", {}, "module_class: expected a subclass of PolicyModule, got None"),
+        ("Bonus", {"bonus": "much"}, "training: bonus: expected a number, got 'much'"),
+        ("Bonus", {"bonuss": 1}, "training: bonuss: unknown key, did you mean 'bonus'?"),
+    ],
+)
+def test_an_algorithm_without_the_required_parts_is_refused(
+    folder: Path, name: str, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)) as raised:
+        with_algorithm(with_own_algorithm(folder, name, **settings))
+    assert "\n" not in str(raised.value)
+
+
+def test_the_settings_of_an_own_algorithm_are_stored_as_data_and_read_where_it_is_imported(folder: Path) -> None:
+    league = with_algorithm(with_own_algorithm(folder, "Bonus", lr=0.01))
+    stored = json.loads(league.model_dump_json(by_alias=True))
+    assert (stored["training"]["bonus"], stored["training"]["gamma"], stored["training"]["lr"]) == (1, 0.5, 0.01)
+    assert LeagueConfig.from_mapping(stored) == league
+    del IMPORTED[league.training.algorithm]
+    read = LeagueConfig.from_mapping(stored)
+    assert type(read.training) is OwnSettings
+    assert json.loads(read.with_training(steps=7).model_dump_json(by_alias=True))["training"] == (
+        stored["training"] | {"steps": 7}
+    )
+    config = algorithm_config(read, interface(read))
+    assert config.copy(copy_frozen=False).learner_class is config.learner_class
+
+
+def test_an_installed_algorithm_has_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    metadata = tmp_path / "own_algorithm-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: own-algorithm\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(f"[{GROUP}]\nbonus = algorithm_of_test:Bonus\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    training = {"algorithm": "bonus"}
+    league = LeagueConfig.from_mapping({"league": "own", "environment": {"entry_point": "a:b"}, "training": training})
+    assert league.training.algorithm == "algorithm_of_test:Bonus"

@@ -18,7 +18,7 @@ from league.spaces import MultiDiscrete
 from league.spaces.conversion import to_gymnasium
 from tests.support.leagues.training_leagues import counting, solvable, solvable_by_dqn, tictactoe
 from training.algorithms import rllib_config
-from training.algorithms.ppo import module_spec
+from training.algorithms.rllib_config import module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy, graph_tensors
 from training.export.parity import ObservedBatch

@@ -10,6 +10,7 @@ import torch
 from league.environments.building import interface
 from league.errors import ParityError
 from league.policies import load
+from league.policies.graph_runs import open_session
 from league.policies.onnx import OnnxPolicy
 from league.policies.probes import Probes
 from league.registry.registry import Registry
@@ -19,10 +20,10 @@ from league.spaces import Discrete
 from league.stack import installed
 from tests.support.leagues.training_leagues import solvable, tictactoe
 from training.export import publish as publishing
-from training.export.publish import Checkpoint, git_commit, load_modules, publish
+from training.export.publish import Checkpoint, git_commit, load_modules, load_scales, publish
 from training.runs.trial import build_algorithm
 
-LEAGUE = tictactoe(train_batch_size=64, minibatch_size=32, epochs=1)
+LEAGUE = tictactoe(train_batch_size=64, minibatch_size=32, epochs=1, normalize_values=True)
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +83,13 @@ def test_a_version_has_a_complete_manifest_and_acts_like_its_checkpoint(registry
     tensors = {name: torch.from_numpy(array) for name, array in rows.items()}
     expected = module.forward_inference({"obs": tensors})["action_dist_inputs"].argmax(-1)
     assert policy.act(rows).actions.tolist() == expected.tolist()
+    assert {"shared.onnx", "shared.value.onnx"} < manifest.files.keys()
+    logits, values = open_session((artefact / "shared.value.onnx").read_bytes()).run(None, rows)
+    scale = load_scales(artefact / TRAINING, LEAGUE)["shared"]
+    assert scale.deviation != 1
+    module_values = module.compute_values({"obs": tensors}).detach().numpy()
+    np.testing.assert_allclose(values, scale.denormalized(module_values), atol=1e-5)
+    np.testing.assert_allclose(logits, policy.distribution(rows).dist_inputs, atol=1e-5)
 
 
 @pytest.mark.usefixtures("ray_session")
@@ -101,6 +109,7 @@ def test_a_recurrent_policy_is_exported_with_its_state(tmp_path: Path) -> None:
             source, registry=registry, config=league, interface=interface_of_league, parent=None, git_commit=None
         )
         assert [tensor.name for tensor in row.manifest.policies["shared"].state] == ["state_in_0", "state_in_1"]
+        assert row.manifest.policies["shared"].value is None
         probes = Probes.from_bytes(
             (registry.versions.fetch("remembering", row.number) / "shared.probes.npz").read_bytes(), "probes"
         )

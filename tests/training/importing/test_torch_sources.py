@@ -27,6 +27,7 @@ from training.importing.source import Source, known_logits
 ROWS = 300
 SEEN = gymnasium.spaces.Box(-9.0, 9.0, (4,), np.float32)
 FIVE = gymnasium.spaces.Discrete(5)
+MASK = gymnasium.spaces.Box(0, 1, (5,), np.int8)
 STEERED = gymnasium.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 1.0], np.float32))
 MODULES = Path("learner_group", "learner", "rl_module")
 
@@ -221,6 +222,30 @@ def test_a_file_of_stable_baselines(tmp_path: Path, algorithm: str, action: gymn
     getattr(library, algorithm)("MlpPolicy", SpacesOnly(action), **options).save(tmp_path / "model.zip")
     sources, _ = open_sources(tmp_path / "model.zip", interface(action), kind="sb3", trust=True)
     assert_equal_actions(sources["shared"], action)
+
+
+@pytest.mark.slow
+def test_a_maskable_policy_of_sb3_contrib(tmp_path: Path) -> None:
+    library = pytest.importorskip("sb3_contrib")
+    torch.manual_seed(0)
+    model = library.MaskablePPO("MlpPolicy", SpacesOnly(FIVE))
+    model.save(tmp_path / "model.zip")
+    seen = DictSpace(spaces={"observation": from_gymnasium(SEEN), "action_mask": from_gymnasium(MASK)})
+    spaces = AgentInterface(observation=seen, action=from_gymnasium(FIVE))
+    masked = Interface(agents={"agent": spaces}, policies={"agent": "shared"}, sides={"agent": ("agent",)})
+    sources, _ = open_sources(tmp_path / "model.zip", masked, kind="sb3", trust=True)
+    source, rng = sources["shared"], np.random.default_rng(0)
+    observations = {
+        "observation": rng.uniform(-9, 9, (ROWS, 4)).astype(np.float32),
+        "action_mask": np.eye(5, dtype=np.int8)[rng.integers(5, size=ROWS)]
+        | rng.integers(2, size=(ROWS, 5), dtype=np.int8),
+    }
+    answer = OnnxPolicy(adapt(source.model, source.mapping, spaces, "test")).distribution(observations)
+    masks = observations["action_mask"] != 0
+    expected, _ = model.predict(observations["observation"], action_masks=masks, deterministic=True)
+    assert np.array_equal(source.original.act(observations, {})[0], expected)
+    assert (answer.actions == expected).mean() > 0.99, "but for equal logits"
+    assert masks[np.arange(ROWS), answer.actions].all()
 
 
 @pytest.mark.slow

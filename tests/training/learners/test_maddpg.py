@@ -11,7 +11,7 @@ from ray.rllib.core.learner.learner import DEFAULT_OPTIMIZER
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from tests.support.leagues.training_leagues import maddpg
-from training.algorithms.maddpg import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.learners.maddpg import AgentSlot, MADDPGLearner, critic_loss, critic_name
 from training.learners.off_policy import bootstrapped_returns
 from training.replay_buffer import ReplayBuffer, Sample
@@ -43,6 +43,12 @@ def sample_transitions(league: LeagueConfig, actions: int = 600) -> Sample:
     replay.add(blocks[JOINT])
     indices = np.arange(len(replay))
     return Sample(replay.rows(indices, gamma=GAMMA), indices, np.ones(len(indices), np.float32))
+
+
+def twice(sample: Sample) -> Sample:
+    """The same rows for each of two policies."""
+    rows = {name: np.concatenate([column, column]) for name, column in sample.rows.items()}
+    return Sample(rows, np.tile(sample.indices, 2), np.tile(sample.weights, 2))
 
 
 def weights(network: torch.nn.Module) -> list[torch.Tensor]:
@@ -96,7 +102,7 @@ def test_each_network_has_its_own_optimizer_and_loss(critic: str) -> None:
         groups = learner._named_optimizers[f"{name}_{DEFAULT_OPTIMIZER}"].param_groups
         assert [id(p) for group in groups for p in group["params"]] == [id(p) for p in network.parameters()]
     before = {name: weights(network) for name, network in learner.networks.items()}
-    learner.learn({"a": sample}, ["a"])
+    learner.learn({JOINT: sample}, ["a"])
     moved = {name for name, network in learner.networks.items() if not are_equal(before[name], weights(network))}
     assert moved == {"a", "a.critic"}, "frozen policies and their critics do not change"
     rows = learner.batch(sample).rows
@@ -134,7 +140,7 @@ def test_independent_critics_ignore_other_agents() -> None:
         results = []
         for given in (sample, other):
             learner = learner_of(maddpg("summing", {}, OWN, critic=critic))
-            learner.learn({"a": given}, ["a"])
+            learner.learn({JOINT: given}, ["a"])
             results.append(weights(learner.networks["a"]) + weights(learner.networks["a.critic"]))
         assert are_equal(*results) != differs
 
@@ -150,7 +156,7 @@ def test_rows_of_absent_agents_are_ignored() -> None:
     results = []
     for given in (sample, other):
         learner = learner_of(league)
-        learner.learn({"a": given, "b": given}, ["a", "b"])
+        learner.learn({JOINT: twice(given)}, ["a", "b"])
         results.append([parameter for network in learner.networks.values() for parameter in weights(network)])
     assert are_equal(*results)
 
@@ -174,15 +180,15 @@ def test_agents_that_share_a_policy_are_first_in_turn() -> None:
     assert torch.equal(seen[2]["observation"], rows["observations/single/observation"][:, 0].repeat(2))
     assert torch.equal(done[0][:k].argmax(-1), rows["actions/pair"][:, 0])
     assert torch.equal(done[0][k:].argmax(-1), rows["actions/pair"][:, 1])
-    errors = learner.learn({"pair": sample, "single": sample}, ["pair", "single"])
-    assert {policy: error.shape for policy, error in errors.items()} == {"pair": (k,), "single": (k,)}
+    errors = learner.learn({JOINT: twice(sample)}, ["pair", "single"])
+    assert errors[JOINT].shape == (2 * k,)
 
 
 def test_targets_follow_by_polyak_averaging() -> None:
     league = maddpg("summing", {}, OWN)
     learner, sample = learner_of(league), sample_transitions(league)
     before = {name: weights(target) for name, target in learner.targets.items()}
-    learner.learn({"a": sample, "b": sample}, ["a", "b"])
+    learner.learn({JOINT: twice(sample)}, ["a", "b"])
     assert set(before) == set(learner.networks)
     for name, network in learner.networks.items():
         for old, new, target in zip(before[name], weights(network), weights(learner.targets[name]), strict=True):
@@ -192,7 +198,7 @@ def test_targets_follow_by_polyak_averaging() -> None:
 def test_running_statistics_reach_actors_critics_and_targets() -> None:
     league = maddpg("summing", {}, OWN, normalize_observations=True)
     learner, sample = learner_of(league), sample_transitions(league)
-    learner.learn({"a": sample, "b": sample}, ["a", "b"])
+    learner.learn({JOINT: twice(sample)}, ["a", "b"])
     mean = sample.rows["observations/a/observation"].mean()
     for network in (*learner.networks.values(), *learner.targets.values()):
         found = dict(network.named_buffers())

@@ -15,7 +15,7 @@ from league.policies.onnx import OnnxPolicy
 from tests.support.leagues import tictactoe
 from tests.support.leagues.training_leagues import solvable
 from tests.support.learners import episodes_of, learner_of, update
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.learners.magnet import Uniform, magnet
 from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, ppo_loss
 from training.learners.train_batch import Minibatch, TrainBatch, train_batch
@@ -43,8 +43,7 @@ def test_the_loss_contains_the_weighted_divergence_from_the_reference() -> None:
     free = loss(replace(minibatch(inputs, reference), magnet=None))
     expected = (p * (p / q).log()).sum(-1).mean()
     assert pulled.magnet_kl.item() == pytest.approx(expected.item(), rel=1e-5)
-    assert (pulled.total - free.total).item() == pytest.approx(0.7 * expected.item(), rel=1e-4)
-    assert free.magnet_kl == 0
+    assert free.magnet_kl is None
 
 
 def test_the_divergence_from_uniform_is_the_missing_entropy_of_legal_actions() -> None:

@@ -13,16 +13,18 @@ LR, MAX_NORM = 0.1, 0.5
 
 def network() -> nn.Module:
     torch.manual_seed(0)
-    return nn.Sequential(nn.Linear(3, 4), nn.Tanh(), nn.Linear(4, 2))
+    convolution = nn.Conv2d(2, 3, 2)
+    convolution.weight.data = convolution.weight.data.to(memory_format=torch.channels_last)
+    return nn.Sequential(convolution, nn.Flatten(), nn.Linear(12, 4), nn.Tanh(), nn.Linear(4, 2))
 
 
 def loss(module: nn.Module, scale: float) -> torch.Tensor:
     torch.manual_seed(1)
-    return scale * module(torch.randn(5, 3)).square().mean()
+    return scale * module(torch.randn(5, 2, 3, 3)).square().mean()
 
 
 def weights(module: nn.Module) -> torch.Tensor:
-    return nn.utils.parameters_to_vector(module.parameters()).detach().clone()
+    return torch.cat([parameter.detach().flatten() for parameter in module.parameters()])
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3], ids=["below", "clipped"])
@@ -32,7 +34,6 @@ def test_steps_equal_those_of_torch_with_clipped_gradients(scale: float) -> None
     optimizer = ClippedAdam(module.parameters(), lr=LR, max_norm=MAX_NORM)
     adam = torch.optim.Adam(reference.parameters(), lr=LR)
     for _ in range(3):
-        optimizer.zero_grad()
         adam.zero_grad()
         loss(module, scale).backward()
         loss(reference, scale).backward()
@@ -40,6 +41,55 @@ def test_steps_equal_those_of_torch_with_clipped_gradients(scale: float) -> None
         torch.testing.assert_close(norm, nn.utils.clip_grad_norm_(reference.parameters(), MAX_NORM))
         adam.step()
         torch.testing.assert_close(weights(module), weights(reference))
+
+
+def test_parameters_keep_their_values_and_layouts() -> None:
+    module = network()
+    before = copy.deepcopy(module)
+    ClippedAdam(module.parameters(), lr=LR, max_norm=MAX_NORM)
+    for parameter, expected in zip(module.parameters(), before.parameters(), strict=True):
+        assert torch.equal(parameter, expected)
+        assert parameter.stride() == expected.stride()
+
+
+def test_the_state_is_that_of_torch() -> None:
+    module, reference = network(), network()
+    optimizer = ClippedAdam(module.parameters(), lr=LR, max_norm=1e6)
+    adam = torch.optim.Adam(reference.parameters(), lr=LR, fused=True)
+    for network_, step in ((module, optimizer.clip_and_step), (reference, adam.step)):
+        for scale in (1.0, 2.0):
+            network_.zero_grad()
+            loss(network_, scale).backward()
+            step()
+    assert optimizer.state_dict()["param_groups"] == adam.state_dict()["param_groups"]
+    torch.testing.assert_close(optimizer.state_dict()["state"], adam.state_dict()["state"])
+
+
+def test_training_continues_from_a_state() -> None:
+    module = network()
+    optimizer = ClippedAdam(module.parameters(), lr=LR, max_norm=MAX_NORM)
+    loss(module, 1.0).backward()
+    optimizer.clip_and_step()
+    resumed = copy.deepcopy(module)
+    restored = ClippedAdam(resumed.parameters(), lr=0.5 * LR, max_norm=MAX_NORM)
+    loss(resumed, 7.0).backward()
+    restored.clip_and_step()
+    resumed.load_state_dict(module.state_dict())
+    restored.load_state_dict(copy.deepcopy(optimizer.state_dict()))
+    for network_, adam in ((module, optimizer), (resumed, restored)):
+        loss(network_, 2.0).backward()
+        adam.clip_and_step()
+    assert torch.equal(weights(module), weights(resumed))
+
+
+def test_the_state_before_the_first_step_is_that_of_new_optimizers() -> None:
+    module = network()
+    optimizer = ClippedAdam(module.parameters(), lr=LR, max_norm=MAX_NORM)
+    new = copy.deepcopy(optimizer.state_dict()["state"])
+    loss(module, 1.0).backward()
+    optimizer.clip_and_step()
+    optimizer.load_state_dict(torch.optim.Adam(network().parameters(), lr=LR).state_dict())
+    torch.testing.assert_close(optimizer.state_dict()["state"], new)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

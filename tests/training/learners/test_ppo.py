@@ -13,8 +13,8 @@ from league.config.league import LeagueConfig
 from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from league.errors import ConfigError
-from tests.support.leagues.training_leagues import solvable
-from training.algorithms.ppo import algorithm_config
+from tests.support.leagues.training_leagues import solvable, tictactoe
+from training.algorithms.rllib_config import algorithm_config
 from training.learners import ppo
 from training.learners.ppo import PPOLearner
 from training.learners.train_batch import train_batch
@@ -34,10 +34,10 @@ def learner_of(league: LeagueConfig) -> PPOLearner:
     return learner
 
 
-def sample_episodes(league: LeagueConfig, steps: int = 256) -> list[EpisodeChunks]:
+def sample_episodes(league: LeagueConfig, steps: int = 256, **options: Any) -> list[EpisodeChunks]:
     runner = BatchedEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
     try:
-        return runner.sample_chunks(num_timesteps=steps)
+        return runner.sample_chunks(num_timesteps=steps, **options)
     finally:
         runner.stop()
 
@@ -104,8 +104,9 @@ def test_a_frozen_policy_keeps_weights_and_optimizer(training: dict[str, Any]) -
         ("far_numbers", {"normalize_observations": True}),
         ("remembering", {"recurrence": {"width": 8, "sequence": 2}}),
         ("numbers", {}),
+        ("watching", {"policies": TWO["policies"], "critic": "central", "normalize_values": True}),
     ],
-    ids=["shared", "normalised", "recurrent", "continuous"],
+    ids=["shared", "normalised", "recurrent", "continuous", "central critics"],
 )
 def test_a_restored_learner_continues_identically(name: str, options: dict[str, Any], tmp_path: Path) -> None:
     league = solvable(name, **options)
@@ -223,3 +224,10 @@ def test_a_gpu_learns_like_the_cpu(two: tuple) -> None:
     for policy, state in weights(learners[0]).items():
         for name, value in state.items():
             np.testing.assert_allclose(weights(learners[1])[policy][name], value, atol=1e-4)
+
+
+def test_the_policy_imitates_the_teacher() -> None:
+    league = tictactoe(teacher={"ref": "script:first", "weight": 3.0}, lr=0.01)
+    learner, episodes = learner_of(league), sample_episodes(league, taught=("shared",))
+    losses = [learn(learner, episodes)["shared"][ppo.TEACHER_LOSS].peek() for _ in range(25)]
+    assert losses[-1] < losses[0] / 2

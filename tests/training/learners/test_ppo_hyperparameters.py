@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import pytest
 
 from league.config.schedules import ScheduleProgress
 from league.errors import ConfigError
 from tests.support.leagues.training_leagues import tictactoe
-from training.learners.ppo import Hyperparameters, hyperparameters, scheduled_hyperparameters
+from training.learners.ppo import WARM_UP, Hyperparameters, hyperparameters, scheduled_hyperparameters
 
 SETTINGS = tictactoe(gamma=0.9, per_policy={"b": {"lambda": 0.5, "lr": 0.01}}, **{"lambda": 0.8}).training
 
@@ -29,6 +31,16 @@ def test_each_policy_follows_its_own_schedule() -> None:
         "b": pytest.approx((0.175, 0.2)),
     }
     assert [scheduled_hyperparameters(settings, policy) for policy in ("a", "b")] == [("lr", "clip"), ("lr",)]
+
+
+@pytest.mark.parametrize(
+    ("batch_scale", "steps", "factor"), [(1, WARM_UP, 1), (16, 0, 1), (16, WARM_UP // 2, 2.5), (16, 9 * WARM_UP, 4)]
+)
+def test_the_learning_rate_grows_with_the_batch(batch_scale: int, steps: int, factor: float) -> None:
+    scaled = SETTINGS.model_copy(update={"batch_scale": batch_scale})
+    at = ScheduleProgress(steps=steps, budget=0.5)
+    before, after = (hyperparameters(settings, ("a", "b"), at) for settings in (SETTINGS, scaled))
+    assert after == {policy: replace(values, lr=factor * values.lr) for policy, values in before.items()}
 
 
 def test_an_unknown_policy_is_reported() -> None:

@@ -1,5 +1,7 @@
 """The loss and its gradient, compared with RLlib's."""
 
+import inspect
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.core.columns import Columns
@@ -23,6 +27,7 @@ from league.spaces.conversion import from_gymnasium
 from training.learners.ppo import ppo_loss
 from training.learners.train_batch import Minibatch
 from training.modules.distributions import torch_distribution
+from training.modules.policy_module import MASKED_LOGIT
 from training.sampling.distributions import distribution as sampled_from
 
 ROWS, CLIP, ENTROPY, VALUE = 64, 0.2, 0.03, 0.7
@@ -74,27 +79,60 @@ def rllib_loss(minibatch: Minibatch, dist_inputs: torch.Tensor, values: torch.Te
 )
 def test_loss_and_gradient_equal_rllibs(space: gymnasium.Space, dist: Any) -> None:
     steps = minibatch(space)
-    new, values = (steps.dist_inputs + 0.4 * torch.randn_like(steps.dist_inputs)), torch.randn(ROWS)
-    gradients, losses = [], []
-    for theirs in (True, False):
-        inputs, predicted = new.clone().requires_grad_(), values.clone().requires_grad_()
-        if theirs:
-            total, logged = rllib_loss(steps, inputs, predicted, dist)
-        else:
-            ours = ppo_loss(
-                steps, inputs, predicted, torch_distribution(space), clip=CLIP, entropy=ENTROPY, value_loss=VALUE
-            )
-            total = ours.total
-        total.backward()
-        gradients.append((inputs.grad, predicted.grad))
-        losses.append(total.item())
-    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
-    for expected, found in zip(*gradients, strict=True):
-        assert torch.allclose(expected, found, atol=1e-6)
-    assert ours.policy.item() == pytest.approx(logged["policy_loss"].item(), rel=1e-5)
-    assert ours.value.item() == pytest.approx(logged["vf_loss"].item(), rel=1e-5)
-    assert ours.entropy.item() == pytest.approx(logged["entropy"].item(), rel=1e-5)
-    assert 0.1 < ours.clip_fraction < 0.9, "clipping must occur"
+    inputs = (steps.dist_inputs + 0.4 * torch.randn_like(steps.dist_inputs)).requires_grad_()
+    values = torch.randn(ROWS).requires_grad_()
+    total, logged = rllib_loss(steps, inputs, values, dist)
+    total.backward()
+    loss = ppo_loss(steps, inputs, values, torch_distribution(space), clip=CLIP, entropy=ENTROPY, value_loss=VALUE)
+    for output, gradient in zip(loss.outputs, loss.gradients, strict=True):
+        assert torch.allclose(output.grad, gradient, atol=1e-6)
+    assert loss.policy.item() == pytest.approx(logged["policy_loss"].item(), rel=1e-5)
+    assert loss.value.item() == pytest.approx(logged["vf_loss"].item(), rel=1e-5)
+    assert loss.entropy.item() == pytest.approx(logged["entropy"].item(), rel=1e-5)
+    assert 0.1 < loss.clip_fraction < 0.9, "clipping must occur"
+
+
+def total(steps: Minibatch, loss: Any, options: dict[str, float]) -> torch.Tensor:
+    """The weighted sum of the parts of a loss, for automatic differentiation."""
+    weighted = loss.policy + options["value_loss"] * loss.value - options["entropy"] * loss.entropy
+    return steps.fraction * (weighted + options["magnet"] * loss.magnet_kl + options["teacher"] * loss.teacher)
+
+
+WEIGHTS = st.floats(0, 2)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.sampled_from([spaces.Discrete(5), spaces.MultiDiscrete([2, 3]), spaces.Box(-1, 1, (3,))]),
+    st.fixed_dictionaries(
+        dict.fromkeys(("entropy", "value_loss", "magnet", "teacher"), WEIGHTS) | {"clip": st.floats(0.01, 0.9)}
+    ),
+    st.floats(0.1, 1),
+    st.integers(0, 2**32 - 1),
+    st.booleans(),
+)
+def test_the_gradient_is_that_of_automatic_differentiation(
+    space: gymnasium.Space, options: dict[str, float], fraction: float, seed: int, masked: bool
+) -> None:
+    """In float64, for all distributions, weights and clipped or masked steps."""
+    torch.manual_seed(seed)
+    old = torch.randn(ROWS, dist_inputs_size(from_gymnasium(space)), dtype=torch.float64)
+    if masked and isinstance(space, spaces.Discrete):
+        old[: ROWS // 2, 3:] = MASKED_LOGIT
+    raw, taught = (
+        torch.from_numpy(sampled_from(from_gymnasium(space)).sample(old.float().numpy(), np.random.default_rng(n))[0])
+        for n in (seed, seed + 1)
+    )
+    distribution = torch_distribution(space)
+    shifted, magnet = (old + 0.5 * torch.randn_like(old) for _ in range(2))
+    log_p, _ = distribution.evaluate(old, raw)
+    advantages, targets, values = torch.randn(3, ROWS, dtype=torch.float64).unbind()
+    steps = Minibatch({}, raw, old, log_p, advantages, targets, magnet, taught, fraction)
+    outputs = shifted.requires_grad_(), values.requires_grad_()
+    # The undecorated function has a graph.
+    total(steps, inspect.unwrap(ppo_loss)(steps, *outputs, distribution, **options), options).backward()
+    for output, gradient in zip(outputs, ppo_loss(steps, *outputs, distribution, **options).gradients, strict=True):
+        torch.testing.assert_close(gradient, output.grad, rtol=1e-9, atol=1e-12)
 
 
 def test_an_unchanged_policy_is_not_clipped() -> None:
@@ -109,15 +147,31 @@ def test_an_unchanged_policy_is_not_clipped() -> None:
         value_loss=VALUE,
     )
     assert loss.clip_fraction == 0
-    assert loss.total.item() == pytest.approx(-steps.advantages.mean().item(), abs=1e-6)
+    assert loss.policy.item() == pytest.approx(-steps.advantages.mean().item(), abs=1e-6)
+    assert (loss.value, *loss.gradients[1]) == (0, *[0] * ROWS)
 
 
 def test_all_parts_of_the_loss_are_on_the_device_of_the_data() -> None:
-    """As on a GPU: without a magnet or a teacher, their parts are 0 on the same device."""
+    """As on a GPU."""
     space = spaces.Discrete(4)
     data = minibatch(space)
     columns = (data.actions, data.dist_inputs, data.log_p, data.advantages, data.targets)
     moved = Minibatch({}, *(column.to("meta") for column in columns))
     options = {"clip": CLIP, "entropy": ENTROPY, "value_loss": VALUE}
     loss = ppo_loss(moved, moved.dist_inputs, moved.targets, torch_distribution(space), **options)
-    assert {part.device.type for part in loss} == {"meta"}
+    parts = [part for part in loss[:-2] if part is not None]
+    assert {part.device.type for part in (*parts, *loss.outputs, *loss.gradients)} == {"meta"}
+
+
+def test_the_loss_contains_the_weighted_cross_entropy_of_the_teachers_actions() -> None:
+    torch.manual_seed(0)
+    inputs, actions = torch.randn(30, 3), torch.randint(3, (30,))
+    steps = Minibatch({}, torch.zeros(30, dtype=torch.int64), inputs, torch.zeros(30), *torch.zeros(2, 30))
+    options: dict[str, float] = {"clip": 0.2, "entropy": 0.1, "value_loss": 0.5, "teacher": 0.7}
+    pulled, free = (
+        ppo_loss(each, inputs, torch.zeros(30), torch_distribution(spaces.Discrete(3)), **options)
+        for each in (replace(steps, taught=actions), steps)
+    )
+    expected = torch.nn.functional.cross_entropy(inputs, actions)
+    assert pulled.teacher.item() == pytest.approx(expected.item(), rel=1e-5)
+    assert free.teacher is None

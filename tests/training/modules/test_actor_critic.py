@@ -12,7 +12,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from tests.support.leagues.training_leagues import solvable
-from training.algorithms.ppo import module_spec
+from training.algorithms.rllib_config import module_spec
 from training.modules.actor_critic import ActorCritic, SharedEncoder
 from training.modules.policy_module import MASKED_LOGIT
 

@@ -24,6 +24,16 @@ def test_statistics_of_batches_equal_those_of_all_values(
     np.testing.assert_allclose(normalization.variance, everything.var(0), rtol=1e-6, atol=1e-9 * deviation**2)
 
 
+def test_rows_that_are_not_counted_do_not_affect_the_statistics() -> None:
+    values, counted = torch.randn(9, 2, 3), torch.arange(9) % 3 > 0
+    selected, masked = RunningNormalization((2, 3)), RunningNormalization((2, 3))
+    for factor in (1, 5):
+        selected.update(factor * values[counted])
+        masked.update(torch.where(counted.view(-1, 1, 1), factor * values, 1e6), counted)
+    masked.update(values, torch.zeros(9, dtype=torch.bool))
+    torch.testing.assert_close(dict(masked.named_buffers()), dict(selected.named_buffers()))
+
+
 def test_values_are_shifted_scaled_and_clipped() -> None:
     normalization = RunningNormalization((2,))
     values = torch.tensor([[3.0, -50.0], [1e9, 2.0]])

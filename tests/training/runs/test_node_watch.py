@@ -5,7 +5,7 @@ import ray
 from ray.exceptions import RpcError
 
 from league import ray_cluster
-from league.config.ppo import PPOConfig
+from training.algorithms.resources import Resources
 from training.runs import node_watch, tune
 from training.runs.node_watch import NodeWatch
 
@@ -20,7 +20,7 @@ class Nodes:
         self.alive, self.draining = "ab", set[str]()
         self.said: list[str] = []
         self.moves = 0
-        self.watch = NodeWatch(PPOConfig(runners=2, gpus=gpus), share, self.said.append, self._move)
+        self.watch = NodeWatch(Resources(2, num_envs=1, threads=1, gpus=gpus), share, self.said.append, self._move)
         monkeypatch.setattr(ray, "nodes", self._nodes)
         monkeypatch.setattr(ray_cluster, "draining_nodes", lambda: self.draining)
         monkeypatch.setattr(node_watch, "draining_nodes", lambda: self.draining)

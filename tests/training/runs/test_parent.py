@@ -37,6 +37,13 @@ def test_a_version_that_was_trained_continues(registry: Registry) -> None:
     assert start_version(registry, first, registries.config(), None) == first
 
 
+def test_a_search_version_continues_with_what_it_plays(registry: Registry) -> None:
+    first = publish(registry)
+    publish(registry)
+    search = registry.publisher.publish_search(LEAGUE, 1, "puct", 8, 1.0)
+    assert start_version(registry, CheckpointRef(LEAGUE, search.number), registries.config(), None) == first
+
+
 def test_in_place_of_an_imported_version_the_newest_one_continues(registry: Registry) -> None:
     imported = publish(registry, algorithm="imported")
     assert start_version(registry, imported, registries.config(), None) is None
@@ -66,3 +73,12 @@ def test_a_version_continues_with_its_own_network_only(
         return
     with pytest.raises(ConfigError, match=rf"^training\.{changed}: tictactoe@1 was trained with .*, got "):
         check_network(version, config.with_training(**settings))
+
+
+def test_an_algorithm_continues_what_one_that_it_is_derived_from_has_trained(registry: Registry) -> None:
+    settings = {"algorithm": "marwil", "data": "games"}
+    version = registry.versions.resolve(publish(registry, algorithm="marwil", settings=settings))
+    check_network(version, registries.config())
+    other = LeagueConfig.from_mapping(registries.config().model_dump() | {"training": {"algorithm": "dqn"}})
+    with pytest.raises(ConfigError, match=r"^training\.algorithm: tictactoe@1 was trained with marwil, got dqn$"):
+        check_network(version, other)

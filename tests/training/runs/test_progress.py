@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from rich.console import Console
 
 from league.config.ppo import PPOConfig
+from training.algorithms.resources import Resources
 from training.runs.progress import TrainingProgress, clock
 
 SETTINGS = PPOConfig(steps=1000, minutes=2)
@@ -73,6 +74,32 @@ def test_shares_of_sampling_and_learning_are_of_all_phases() -> None:
     }
     (line,) = output_of(METRICS | phases).splitlines()
     assert "12 steps/s (25% sampling, 62% learning)  1:00 elapsed" in line
+
+
+def test_a_run_with_runners_and_a_gpu_shows_what_is_idle() -> None:
+    phases = {
+        "time/waiting": 0.1,
+        "time/learning": 1.8,
+        "time/other": 0.1,
+        "time/runners_sampling": 1.0,
+        "time/runners_idle": 3.0,
+        "gpu/memory_gb": 1.25,
+    }
+    (line,) = output_of(METRICS | phases).splitlines()
+    assert "12 steps/s (5% waiting, 90% learning, runners 75% idle, GPU 1.2 GB)  1:00" in line
+    (line,) = output_of(METRICS | phases | {"gpu/utilization": 12.0}).splitlines()
+    assert "runners 75% idle, GPU 12%, 1.2 GB)" in line
+
+
+def test_the_advice_is_about_the_whole_run() -> None:
+    file = io.StringIO()
+    progress = TrainingProgress(Console(file=file, width=200), SETTINGS, {"agent_0": "a"})
+    busy = {"time/learning": 20.0, "time/runners_sampling": 4.0, "time/runners_idle": 36.0}
+    for use in (10.0, 30.0):
+        progress.update(METRICS | busy | {"gpu/utilization": use})
+    progress.advise(Resources(2, num_envs=8, threads=1, gpus=1.0), cores=16)
+    line = file.getvalue().splitlines()[-1]
+    assert "its 2 runners are idle 90%: learning limits the run. `runners: 1` is enough. The GPU is used 20%" in line
 
 
 def test_durations_are_formatted_as_a_clock() -> None:

@@ -14,19 +14,11 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER
 from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunRow
 from league.settings import Storage
-from tests.support.leagues.registries import interface
 from tests.support.leagues.training_leagues import tictactoe
+from training.algorithms.resources import Resources
 from training.runs import run_directory
 from training.runs.run_directory import CHECKPOINTS, RunDirectory
 from training.runs.run_reporter import RunReporter
-
-
-@pytest.fixture
-def registry(tmp_path: Path) -> Iterator[Registry]:
-    opened = Registry.open(Storage.at(tmp_path / "home"))
-    opened.leagues.register(tictactoe(), interface())
-    yield opened
-    opened.close()
 
 
 @pytest.fixture
@@ -75,6 +67,30 @@ def test_only_the_budget_may_change(registry: Registry, storage: Storage) -> Non
     RunDirectory.resume(registry, tictactoe(steps=5, minutes=1, checkpoint_every=2, checkpoint_minutes=3, runners=3))
     with pytest.raises(ConfigError, match=r"training\.lr has changed"):
         RunDirectory.resume(registry, tictactoe(lr=0.5))
+
+
+AUTO = {"runners": "auto", "num_envs": "auto", "threads": "auto", "gpus": "auto"}
+CHOSEN = Resources(runners=3, num_envs=16, threads=2, gpus=1.0)
+
+
+def test_a_resumed_run_keeps_what_was_chosen_when_it_began(registry: Registry, storage: Storage) -> None:
+    """On any machine, so that its versions are those of the uninterrupted run."""
+    RunDirectory.begin(storage, tictactoe(**AUTO), None, None).use(CHOSEN)
+    resumed = RunDirectory.resume(registry, tictactoe(**AUTO)).record.config
+    assert resumed == tictactoe(**CHOSEN.settings)
+    resumed = RunDirectory.resume(registry, tictactoe(**AUTO | {"runners": 1, "gpus": 0})).record.config
+    assert resumed == tictactoe(**CHOSEN.settings | {"runners": 1, "gpus": 0.0})
+    with pytest.raises(ConfigError, match=r"training\.num_envs has changed"):
+        RunDirectory.resume(registry, tictactoe(**AUTO | {"num_envs": 8}))
+
+
+def test_a_run_with_a_name_fits_the_machine_that_continues_it(registry: Registry) -> None:
+    RunDirectory.begin(registry.storage, tictactoe(**AUTO), None, None, name="night-1").use(CHOSEN)
+    found = RunDirectory.find(registry, tictactoe(**AUTO), "night-1")
+    assert found is not None
+    assert found.record.config == tictactoe(**AUTO | {"num_envs": 16, "batch_scale": 1}), (
+        "what is learned is that of the run"
+    )
 
 
 def test_a_complete_run_continues_with_a_larger_budget(registry: Registry, storage: Storage) -> None:

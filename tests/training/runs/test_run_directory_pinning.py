@@ -69,6 +69,14 @@ def test_a_mixture_is_pinned_as_one_and_played_by_its_members(tmp_path: Path) ->
         pin_opponents(magnet, registry, spaces)
 
 
+def test_in_training_a_search_version_plays_without_its_search(tmp_path: Path) -> None:
+    registry = tictactoe.registry(tmp_path)
+    tictactoe.publish(registry, tictactoe.graph())
+    registry.publisher.publish_search("tictactoe", 1, "puct", 8, 1.0)
+    league = with_opponents("@2").with_training(teacher={"ref": "@2", "weight": 1})
+    assert pin_opponents(league, registry, registry.leagues.get("tictactoe").interface) == {"@2": "tictactoe@1"}
+
+
 def test_the_references_of_a_sweeps_trials_are_pinned_too(tmp_path: Path) -> None:
     registry = mixed_champion(tmp_path)
     spaces = registry.leagues.get("tictactoe").interface

@@ -2,9 +2,7 @@
 
 import io
 import threading
-from collections.abc import Iterator
 from datetime import UTC, datetime
-from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -14,20 +12,11 @@ from league.config.league import LeagueConfig
 from league.errors import GameHung
 from league.registry.registry import Registry
 from league.registry.storage.rows import StrengthRow, VersionRow
-from league.settings import Storage
-from tests.support.leagues.registries import LEAGUE, interface, publish
+from tests.support.leagues.registries import LEAGUE, publish
 from tests.support.leagues.training_leagues import tictactoe
 from training.runs.progress import TrainingProgress
 from training.runs.run_directory import RunDirectory
 from training.runs.strength_queue import Measure, StrengthQueue
-
-
-@pytest.fixture
-def registry(tmp_path: Path) -> Iterator[Registry]:
-    opened = Registry.open(Storage.at(tmp_path / "home"))
-    opened.leagues.register(tictactoe(), interface())
-    yield opened
-    opened.close()
 
 
 class Run:

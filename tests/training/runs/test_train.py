@@ -3,16 +3,17 @@
 import dataclasses
 import io
 import json
-import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import closing, nullcontext
 from pathlib import Path
 
+import psutil
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -80,7 +81,7 @@ def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> Non
     assert lineage(trained.versions) == [(1, 512, None), (2, 1024, 1)]
     assert "Published tictactoe@1 after 512 steps" in trained.output
     assert "shared: return" in trained.output
-    assert "Environments: 4 in one runner." in trained.output
+    assert ": 1 runner of 4 environments, a learner of 1 thread." in trained.output
     assert "pettingzoo.classic.tictactoe_v3: It is vectorised by " in trained.output
     (run,) = (registry.storage.home / "runs" / "tictactoe").iterdir()
     assert not list(run.rglob("checkpoints/*")), "published checkpoints are deleted"
@@ -97,7 +98,8 @@ def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> Non
     }
     assert {f"shared/{name}" for name in of_policy} <= set(tags)
     assert {"agents/player_1/return", "agents/player_2/length", "run/return", "run/crashes"} <= set(tags)
-    assert {"run/steps_per_second", *(f"time/{name}" for name in ("sampling", "learning", "weights"))} <= set(tags)
+    assert {"run/steps_per_second", *(f"time/{name}" for name in ("waiting", "learning", "weights"))} <= set(tags)
+    assert {"time/runners_sampling", "time/runners_idle"} <= set(tags)
     assert curves(run).Scalars("shared/entropy")[-1].step == 1024
     assert not any(tag.startswith("ray/") or "since_restore" in tag for tag in tags), "only curves are recorded"
     (record,) = registry.runs.newest("tictactoe")
@@ -127,6 +129,8 @@ def test_an_interrupted_run_says_how_to_continue_it(
     """`league nightly` has no `--resume`."""
     registry.leagues.register(LEAGUE, interface(LEAGUE))
     monkeypatch.setattr("training.runs.train.connected", lambda *_: nullcontext())
+    monkeypatch.setattr("training.runs.train.node_resources", lambda: [{"CPU": 2.0}])
+    monkeypatch.setattr("training.runs.train.cluster_cpus", lambda: 2)
     monkeypatch.setattr("training.runs.train.RunDriver._attempts", lambda *_: False)
     with pytest.raises(Interrupted, match=re.escape(how)):
         train(LEAGUE, registry=registry, name=name, console=Console(quiet=True))
@@ -172,18 +176,17 @@ def test_an_exploiter_is_trained_against_one_version(trained: Trained) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_an_off_policy_run_publishes_and_continues(registry: Registry) -> None:
-    """Versions, continued training with and without the replay buffer, and a version as opponent."""
+    """Versions, continued training without the replay buffer, and a version as opponent."""
     settings = {"algorithm": "dqn", "runners": 1, "steps": 2048, "checkpoint_every": 1024, "learning_starts": 256}
     league = tictactoe(**settings)
     versions = train(league, registry=registry, console=Console(file=io.StringIO()))
     assert lineage(versions) == [(1, 1024, None), (2, 2048, 1)]
     assert versions[0].manifest.algorithm == "dqn"
-    for kept in (True, False):
-        shown, parent = io.StringIO(), CheckpointRef("tictactoe", 1)
-        further = league.with_training(steps=1024, opponents=["@1"], replay_in_checkpoint=kept, **LOCAL)
-        (version,) = train(further, registry=registry, parent=parent, console=Console(file=shown))
-        assert (version.steps, version.parent) == (2048, 1)
-        assert ("The replay buffer starts empty" in shown.getvalue()) is not kept
+    shown, parent = io.StringIO(), CheckpointRef("tictactoe", 1)
+    further = league.with_training(steps=1024, opponents=["@1"], replay_in_checkpoint=False, **LOCAL)
+    (version,) = train(further, registry=registry, parent=parent, console=Console(file=shown))
+    assert (version.steps, version.parent) == (2048, 1)
+    assert "The replay buffer starts empty" in shown.getvalue()
     with pytest.raises(ConfigError, match=r"training\.algorithm: tictactoe@1 was trained with dqn, got ppo"):
         train(tictactoe(), registry=registry, parent=CheckpointRef("tictactoe", 1))
     with pytest.raises(ConfigError, match=r"training\.dueling: tictactoe@1 was trained with True, got False"):
@@ -279,16 +282,13 @@ def test_continued_training_requires_the_same_network(trained: Trained) -> None:
 RAISED = ("league faulty", "ZeroDivisionError: division by zero", "faulty.py:13", "attempt-1/error.txt")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 @pytest.mark.parametrize(
     ("entry_point", "runners", "messages"),
-    [
-        pytest.param("raising", 0, RAISED, marks=pytest.mark.slow),
-        pytest.param("raising", 1, RAISED, marks=pytest.mark.slow),
-        pytest.param("unrewarding", 1, ("faulty", "player_1", "nan"), marks=pytest.mark.slow),
-    ],
+    [("raising", 1, RAISED), ("unrewarding", 0, ("faulty", "player_1", "nan"))],
 )
-def test_a_fault_of_the_environment_in_a_runner_is_one_sentence(
+def test_a_fault_of_the_environment_is_one_sentence(
     registry: Registry, entry_point: str, runners: int, messages: tuple[str, ...]
 ) -> None:
     league = LeagueConfig.from_mapping(
@@ -328,20 +328,29 @@ def uninterrupted(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -
         return train(SLOW, registry=registry)
 
 
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The home of a run whose driver was killed with SIGKILL after its first checkpoint."""
+    home = tmp_path_factory.mktemp("interrupted") / "home"
+    driver = subprocess.Popen([sys.executable, "-c", SCRIPT, str(home)], stdout=subprocess.DEVNULL)
+    try:
+        until(lambda: any(home.glob("runs/tictactoe/*/attempt-1/checkpoints/512")), DEADLINE)
+    finally:
+        workers = psutil.Process(driver.pid).children(recursive=True)
+        driver.kill()
+        driver.wait()
+    _, running = psutil.wait_procs(workers, DEADLINE)
+    assert not running, "Ray's processes end with their driver"
+    return home
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("home_is_lost", [False, True], ids=["same machine", "other machine"])
 def test_a_killed_run_publishes_the_same_versions_after_resuming(
-    tmp_path: Path, uninterrupted: list[VersionRow], home_is_lost: bool
+    tmp_path: Path, uninterrupted: list[VersionRow], interrupted: Path, home_is_lost: bool
 ) -> None:
-    """The driver is killed with SIGKILL during the run. It is resumed on a machine that has its directory, or has only
-    the registry and the versions."""
-    home = tmp_path / "killed"
-    driver = subprocess.Popen([sys.executable, "-c", SCRIPT, str(home)], stdout=subprocess.DEVNULL)
-    try:
-        _wait_for_checkpoint(home)
-    finally:
-        os.kill(driver.pid, signal.SIGKILL)
-        driver.wait()
+    """It is resumed on a machine that has its directory, or has only the registry and the versions."""
+    home = shutil.copytree(interrupted, tmp_path / "home")
     killed = Registry.open(Storage.at(home))
     before = killed.versions.all("tictactoe")
     assert len(before) < 3, "the driver was killed too late"
@@ -360,10 +369,33 @@ def test_a_killed_run_publishes_the_same_versions_after_resuming(
     assert steps == sorted(steps)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("process", "settings"),
+    [("FurtherLearner", LOCAL | {"learners": 2, "epochs": 8}), ("BatchedEnvRunner", {"epochs": 64})],
+)
+def test_a_lost_process_is_replaced(
+    ray_session: None, registry: Registry, process: str, settings: dict[str, int]
+) -> None:
+    """A run continues from its newest version."""
+    league = tictactoe(steps=2560, **SETTINGS | {"minibatch_size": 32} | settings)
+    home = registry.storage.home
+
+    def kill() -> None:
+        until(lambda: any(home.glob("runs/tictactoe/*/attempt-1/checkpoints/512")), DEADLINE)
+        workers = psutil.Process().children(recursive=True)
+        next(worker for worker in workers if process in "".join(worker.cmdline())).kill()
+
+    output, killer = io.StringIO(), threading.Thread(target=kill)
+    killer.start()
+    versions = train(league, registry=registry, console=Console(file=output, width=200))
+    killer.join()
+    assert [version.steps for version in versions] == [512, 1024, 1536, 2048, 2560]
+    assert "A process was lost" in output.getvalue()
+    (record,) = registry.runs.newest("tictactoe")
+    assert (record.state, record.attempts) == ("ended", 2)
+
+
 def graphs(version: VersionRow) -> dict[str, str]:
     """The digest of each ONNX file."""
     return {name: digest for name, digest in version.manifest.files.items() if name.endswith(".onnx")}
-
-
-def _wait_for_checkpoint(home: Path) -> None:
-    until(lambda: any(home.glob("runs/tictactoe/*/attempt-1/checkpoints/512")), DEADLINE)

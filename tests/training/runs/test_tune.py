@@ -2,8 +2,8 @@ import pytest
 import ray
 
 from league import ray_cluster
-from league.config.ppo import PPOConfig
 from league.errors import ConfigError
+from training.algorithms.resources import Resources
 from training.runs import tune
 from training.runs.tune import cpu_share, placement
 
@@ -11,9 +11,15 @@ from training.runs.tune import cpu_share, placement
 @pytest.mark.usefixtures("ray_session")
 def test_learner_and_runners_share_the_available_cpus() -> None:
     """Tests have two CPUs."""
-    assert [cpu_share(0), cpu_share(1), cpu_share(3), cpu_share(1, at_once=2)] == pytest.approx([1.0, 1.0, 0.5, 0.5])
-    with pytest.raises(ConfigError, match="100 runners are too many for 2 CPUs"):
-        cpu_share(100)
+    assert [cpu_share(1), cpu_share(2), cpu_share(4), cpu_share(2, at_once=2)] == pytest.approx([1.0, 1.0, 0.5, 0.5])
+    with pytest.raises(
+        ConfigError, match=r"training\.learners, training\.runners: 101 processes are too many for 2 CPUs"
+    ):
+        cpu_share(101)
+
+
+def using(runners: int, gpus: float = 0.0, runner_gpus: float = 0.0, learners: int = 1) -> Resources:
+    return Resources(runners, num_envs=1, threads=1, gpus=gpus, runner_gpus=runner_gpus, learners=learners)
 
 
 def machines(monkeypatch: pytest.MonkeyPatch, *resources: dict[str, float]) -> None:
@@ -25,13 +31,25 @@ def machines(monkeypatch: pytest.MonkeyPatch, *resources: dict[str, float]) -> N
 
 def test_a_trial_requests_its_learner_and_its_runners_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
     machines(monkeypatch, {"CPU": 8.0, "GPU": 1.0})
-    learner, *runners = placement(PPOConfig(runners=2, gpus=0.5, runner_gpus=0.25), 0.5).bundles
+    learner, *runners = placement(using(runners=2, gpus=0.5, runner_gpus=0.25), 0.5).bundles
     assert (learner["CPU"], learner["GPU"]) == (0.5, 0.5)
     assert runners == [{"CPU": 0.5, "GPU": 0.25}] * 2
-    (alone,) = placement(PPOConfig(runners=0, gpus=0.5, runner_gpus=0.25), 1.0).bundles
+    (alone,) = placement(using(runners=0, gpus=0.5, runner_gpus=0.25), 1.0).bundles
     assert alone["GPU"] == 0.75, "the runner is in the learner's process"
     with pytest.raises(ConfigError, match=r"1\.5 GPUs requested in total, but Ray has 1"):
-        placement(PPOConfig(runners=2, gpus=1, runner_gpus=0.25), 0.5)
+        placement(using(runners=2, gpus=1, runner_gpus=0.25), 0.5)
+
+
+def test_each_learner_requests_its_resources(monkeypatch: pytest.MonkeyPatch) -> None:
+    machines(monkeypatch, {"CPU": 2.0, "GPU": 2.0}, {"CPU": 2.0, "GPU": 1.0})
+    bundles = placement(using(learners=3, runners=1, gpus=1), 1.0).bundles
+    assert bundles == [{"CPU": 1.0, "GPU": 1.0}] * 3 + [{"CPU": 1.0}]
+    with pytest.raises(ConfigError, match=r"training\.learners: expected at most one per CPU, got 5 for 4 CPUs"):
+        placement(using(runners=1, learners=5), 0.5)
+    with pytest.raises(ConfigError, match=r"training\.learners with gpus: 4 GPUs requested in total, but Ray has 3"):
+        placement(using(runners=1, learners=4, gpus=1), 0.5)
+    with pytest.raises(ConfigError, match=r"2 learners need 1 CPUs and 1\.5 GPUs each"):
+        placement(using(runners=1, learners=2, gpus=1.5), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -42,8 +60,8 @@ def test_every_share_fits_on_a_node(
     cpus: tuple[float, ...], runners: int, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machines(monkeypatch, *({"CPU": each} for each in cpus))
-    assert cpu_share(runners) == share
-    assert len(placement(PPOConfig(runners=runners), share).bundles) == runners + 1
+    assert cpu_share(1 + runners) == share
+    assert len(placement(using(runners=runners), share).bundles) == runners + 1
 
 
 def test_what_no_node_has_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,7 +70,7 @@ def test_what_no_node_has_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(
         ConfigError, match=r"the learner needs 0\.5 CPUs and 1 GPUs, but .* 4 CPUs and 0 GPUs; 0 CPUs and 1"
     ):
-        placement(PPOConfig(runners=1, gpus=1), 0.5)
+        placement(using(runners=1, gpus=1), 0.5)
     machines(monkeypatch, {"CPU": 2.0, "GPU": 1.0}, {"CPU": 2.0, "GPU": 1.0})
     with pytest.raises(ConfigError, match=r"3 runners need 0\.5 CPUs and 0\.4 GPUs each"):
-        placement(PPOConfig(runners=3, gpus=0.75, runner_gpus=0.4), 0.5)
+        placement(using(runners=3, gpus=0.75, runner_gpus=0.4), 0.5)

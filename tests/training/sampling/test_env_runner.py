@@ -1,5 +1,6 @@
 """The runner on an environment whose observations identify agent, turn and reset."""
 
+import time
 from collections import defaultdict
 from collections.abc import Iterable
 
@@ -25,10 +26,10 @@ from league.environments.building import interface
 from tests.conformance.stepping import plain_loop
 from tests.support.environments.counting import Counting
 from tests.support.leagues.training_leagues import counting, tictactoe
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.learners.train_batch import train_batch
 from training.runs.trial import build_algorithm
-from training.sampling.env_runner import BatchedEnvRunner
+from training.sampling.env_runner import IDLE_SECONDS, SAMPLING_SECONDS, BatchedEnvRunner
 from training.sampling.episode_chunks import as_episodes
 from training.sampling.play_metrics import ENTROPY
 
@@ -241,6 +242,21 @@ def test_rllibs_learner_accepts_the_episodes_and_agrees_on_value_targets(truncat
     # RLlib's pipeline modifies the episodes.
     fresh = runner.sample(num_timesteps=50)
     assert learner.update(episodes=fresh, num_epochs=1, minibatch_size=32, timesteps={})
+
+
+def test_a_runner_is_idle_between_samples_but_not_while_a_checkpoint_is_saved(monkeypatch: pytest.MonkeyPatch) -> None:
+    runner = runner_of(counting(LIVES, []))
+    clock = iter([0.0, 3.0, 10.0, 12.0, 100.0, 101.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    for is_reset in (False, False, True):
+        if is_reset:
+            runner.reset_episodes(0)
+        with runner.timed_sample():
+            pass
+    monkeypatch.undo()
+    metrics = runner.get_metrics()
+    assert (metrics[SAMPLING_SECONDS].peek(), metrics[IDLE_SECONDS].peek()) == (6.0, 7.0)
+    assert runner.get_metrics()[IDLE_SECONDS].peek() == 0
 
 
 @pytest.mark.slow

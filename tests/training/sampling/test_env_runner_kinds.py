@@ -33,7 +33,7 @@ from tests.support.environments.simultaneous import Simultaneous
 from tests.support.leagues import registries
 from tests.support.leagues.training_leagues import counting, solvable, tictactoe
 from tests.support.policies.graphs import masked_mlp
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.opponents import Opponents
 from training.sampling.play_metrics import CRASHES, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN

@@ -4,7 +4,7 @@ import torch
 
 from league.environments.building import interface
 from tests.support.leagues.training_leagues import maddpg
-from training.algorithms.maddpg import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.replay_buffer import TransitionBlock
 from training.sampling.closed_transitions import JOINT
 from training.sampling.replay_runner import ActorRunner

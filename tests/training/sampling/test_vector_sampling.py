@@ -11,7 +11,7 @@ from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.environments.vector_stepping import VectorStepping
-from training.algorithms.ppo import algorithm_config
+from training.algorithms.rllib_config import algorithm_config
 from training.learners.ppo import PPOLearner
 from training.rllib_compat import TrainingData
 from training.sampling import env_runner

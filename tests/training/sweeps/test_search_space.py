@@ -1,3 +1,6 @@
+import json
+import math
+import sys
 from typing import Any
 
 import pytest
@@ -7,11 +10,15 @@ from hypothesis import strategies as st
 from league.config.sweep import SweepConfig
 from league.errors import ConfigError
 from tests.support.leagues.training_leagues import tictactoe
-from training.sweeps.search_space import applied, format_settings, nested, plan
+from training.sweeps.search_space import Settings, TrialOutcome, applied, format_settings, nested, plan, propose
 
 
-def sweep(parameters: dict[str, Any], samples: int = 1) -> SweepConfig:
-    return SweepConfig(parameters=parameters, samples=samples)
+def sweep(parameters: dict[str, Any], samples: int = 1, **settings: Any) -> SweepConfig:
+    return SweepConfig(parameters=parameters, samples=samples, **settings)
+
+
+def outcome(score: float | None, *, ended_early: bool = False) -> TrialOutcome:
+    return TrialOutcome(score=score, steps=256, seconds=1.0, ended_early=ended_early)
 
 
 def test_trials_are_all_combinations_with_separate_draws() -> None:
@@ -74,6 +81,56 @@ def test_draws_are_within_their_range(seed: int, low: float, factor: float) -> N
 def test_invalid_parameters_are_rejected(values: Any, expected: str) -> None:
     with pytest.raises(ConfigError, match=rf"sweep\.parameters\.lr: expected .*{expected}"):
         plan(tictactoe(), sweep({"lr": values}))
+
+
+SPACE = {
+    "lr": {"loguniform": [1e-5, 1e-1]},
+    "hidden": [[64, 64], [128]],
+    "clip": {"quniform": [0.1, 0.4, 0.1]},
+    "epochs": {"randint": [1, 9]},
+    "per_policy.shared.gamma": {"choice": [0.97, 0.99]},
+}
+
+
+@pytest.mark.parametrize("mode", ["max", "min"])
+def test_optuna_proposes_what_was_better(mode: str) -> None:
+    """The score is best at lr = 10⁻³. Trials that failed, ended early or are running belong to the history, too."""
+    pytest.importorskip("optuna")
+    config, search = tictactoe(), sweep(SPACE, 40, search="optuna", mode=mode)
+    trials: list[tuple[Settings, TrialOutcome | None]] = []
+    for number in range(40):
+        settings = propose(config, search, trials)
+        assert list(settings) == list(SPACE)
+        applied(config, settings)
+        loss = abs(math.log10(settings["lr"]) + 3)
+        score = outcome(loss if mode == "min" else -loss, ended_early=loss > 1)
+        trials.append((settings, {5: None, 7: outcome(None)}.get(number, score)))
+    losses = [abs(math.log10(settings["lr"]) + 3) for settings, _ in trials]
+    assert sum(losses[20:]) / 20 < 0.6, "of random draws, it is 1 on average"
+
+
+def test_a_proposal_depends_on_the_seed_and_the_recorded_trials_only() -> None:
+    pytest.importorskip("optuna")
+    search = sweep(SPACE, 3, search="optuna")
+    first = propose(tictactoe(), search, [])
+    assert propose(tictactoe(), search, []) == first
+    assert propose(tictactoe(seed=2), search, []) != first
+    assert propose(tictactoe(), search, [], attempt=1) != first
+    past = [(json.loads(json.dumps(first)), outcome(0.5))]
+    assert propose(tictactoe(), search, past) == propose(tictactoe(), search, [(first, outcome(0.5))]) != first
+
+
+@pytest.mark.parametrize("distribution", [{"randn": [0, 1]}, {"qloguniform": [0.1, 1, 0.1]}])
+def test_distributions_that_optuna_lacks_are_rejected(distribution: dict[str, Any]) -> None:
+    pytest.importorskip("optuna")
+    with pytest.raises(ConfigError, match=r"sweep\.parameters\.lr: expected .*, lograndint with search: optuna, got"):
+        propose(tictactoe(), sweep({"lr": distribution}, search="optuna"), [])
+
+
+def test_without_optuna_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ConfigError, match=r"search: optuna requires Optuna: pip install 'policy-league\[optuna\]'"):
+        propose(tictactoe(), sweep(SPACE, search="optuna"), [])
 
 
 def test_nested_settings_are_applied() -> None:

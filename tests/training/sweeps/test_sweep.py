@@ -1,11 +1,13 @@
 """Complete sweeps: Ray Tune with several trials, publishing of the best one, interruption."""
 
 import io
+import json
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from training.runs.train import train
 from training.sweeps.sweep import sweep
 
 SETTINGS = {"steps": 2048, "train_batch_size": 256, "minibatch_size": 128, "epochs": 2, "checkpoint_every": 256}
-DEADLINE = 120
+DEADLINE = 240
 
 
 def league(parameters: dict[str, Any], training: dict[str, Any] | None = None, **settings: Any) -> LeagueConfig:
@@ -162,6 +164,49 @@ def test_a_killed_sweep_continues_with_its_unfinished_trials(registry: Registry)
     assert report.version is None
     first_of_second_life = EventAccumulator(str(max((report.path / "trial-001").glob("events*"))))
     assert first_of_second_life.Reload().Scalars("run/steps")[0].step > 256, "the trial continues from its checkpoint"
+
+
+SEARCH = league(
+    {"lr": {"loguniform": [1e-5, 1e-2]}, "minibatch_size": [32, 10_000], "hidden": [[16], [8, 8]]},
+    training={"steps": 768, "epochs": 8},
+    metric="shared/entropy",
+    search="optuna",
+    samples=4,
+)
+"""A minibatch of 10,000 is larger than a batch: such proposals are not tried."""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_a_killed_search_by_optuna_continues_as_the_same_search(registry: Registry, tmp_path: Path) -> None:
+    """The driver is killed with SIGKILL in the second trial. Its settings stay, and later ones follow from results."""
+    pytest.importorskip("optuna")
+    home = registry.storage.home
+    driver = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT.replace("LONG", "SEARCH"), str(home)], stdout=subprocess.DEVNULL
+    )
+    try:
+        _wait_for(home, "sweeps/tictactoe/*/trial-001/checkpoints/[1-9]*")
+    finally:
+        os.kill(driver.pid, signal.SIGKILL)
+        driver.wait()
+    (file,) = home.rglob("sweep.json")
+    before = json.loads(file.read_text())["trials"]
+    assert len(before) < 4, "a trial is recorded when it starts"
+    shown = io.StringIO()
+    report = sweep(SEARCH, registry=registry, resume=True, console=Console(file=shown, width=500))
+    assert report.is_whole
+    assert [trial.outcome.steps for trial in report.trials if trial.outcome] == [768] * 4
+    trials = [trial.settings for trial in report.trials]
+    assert trials[: len(before)] == before
+    assert "Not tried: sweep.parameters: lr" in shown.getvalue()
+    assert {settings["minibatch_size"] for settings in trials} == {32}
+    with closing(Registry.open(Storage.at(tmp_path / "whole"))) as whole:
+        uninterrupted = sweep(SEARCH, registry=whole, console=Console(quiet=True))
+    assert [trial.settings for trial in uninterrupted.trials] == trials
+    assert report.best is not None
+    assert report.version is not None
+    assert report.version.manifest.settings["lr"] == report.best.settings["lr"]
 
 
 def _wait_for(home: Path, pattern: str) -> None:

@@ -58,12 +58,21 @@ class AsyncEpisode:
         """Number of actions so far."""
         return self._steps
 
-    async def act(self, observation: Any, *, probabilities: bool = False) -> Any:
+    async def act(
+        self,
+        observation: Any,
+        *,
+        probabilities: bool = False,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
+    ) -> Any:
         """Request the next action.
 
         Args:
             observation: See `AsyncClient.act`.
             probabilities: Include the action probabilities in the response, which is available as `last`.
+            deadline_ms: See `AsyncClient.act`.
+            analysis: See `AsyncClient.act`. It is in the response, `last`.
 
         Returns:
             The action in the environment's format: an int or an array (float32 or int64).
@@ -79,6 +88,8 @@ class AsyncEpisode:
             seed=None if self._seed is None else derive(self._seed, self._steps),
             probabilities=probabilities,
             state=self._last.state if self._last else None,
+            deadline_ms=deadline_ms,
+            analysis=analysis,
         )
         try:
             response = await self._client.send(calls.act(self._model, request))

@@ -61,6 +61,8 @@ class AsyncStream:
         explore: bool | None = None,
         seed: int | None = None,
         probabilities: bool = False,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
     ) -> Any:
         """Request the action for one observation.
 
@@ -70,6 +72,8 @@ class AsyncStream:
             explore: See `AsyncClient.act`.
             seed: See `AsyncClient.act`.
             probabilities: Include the action probabilities in the response, which is available as `last`.
+            deadline_ms: See `AsyncClient.act`.
+            analysis: See `AsyncClient.act`. It is in the response, `last`.
 
         Returns:
             The action in the environment's format: an int or an array (float32 or int64).
@@ -79,7 +83,13 @@ class AsyncStream:
             LeagueError: See `AsyncClient`.
         """
         request = ActionRequest.build(
-            observation, self._encoding, explore=explore, seed=seed, probabilities=probabilities
+            observation,
+            self._encoding,
+            explore=explore,
+            seed=seed,
+            probabilities=probabilities,
+            deadline_ms=deadline_ms,
+            analysis=analysis,
         )
         await self._send(request, reset)
         assert isinstance(self.last, ActionResponse)
@@ -93,6 +103,8 @@ class AsyncStream:
         explore: bool | None = None,
         seed: int | Sequence[int] | None = None,
         probabilities: bool = False,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
     ) -> list[Any]:
         """Request the actions for a batch of observations.
 
@@ -102,6 +114,8 @@ class AsyncStream:
             explore: See `AsyncClient.act`.
             seed: One seed for the batch, or one for each observation.
             probabilities: See `act`.
+            deadline_ms: See `act`.
+            analysis: See `act`.
 
         Returns:
             The actions, in the order of the observations.
@@ -110,7 +124,13 @@ class AsyncStream:
             LeagueError: See `act`.
         """
         request = BatchActionRequest.build(
-            observations, self._encoding, explore=explore, seed=seed, probabilities=probabilities
+            observations,
+            self._encoding,
+            explore=explore,
+            seed=seed,
+            probabilities=probabilities,
+            deadline_ms=deadline_ms,
+            analysis=analysis,
         )
         await self._send(request, reset if isinstance(reset, bool) else list(reset))
         assert isinstance(self.last, BatchActionResponse)

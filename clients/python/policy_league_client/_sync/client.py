@@ -72,6 +72,8 @@ class Client:
         seed: int | None = None,
         probabilities: bool = False,
         state: str | None = None,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
     ) -> ActionResponse:
         """Request the action for one observation.
 
@@ -84,12 +86,21 @@ class Client:
             seed: Seed for sampling. Without it, `explore` uses a random one, which the response contains.
             probabilities: Include the action probabilities in the response.
             state: Recurrent state of the previous response; None starts an episode. `episode` tracks it for you.
+            deadline_ms: Milliseconds after which a search version plays the best action so far. Others ignore it.
+            analysis: Include what the search expects in the response. Requires a search version.
 
         Returns:
             The action and the version that chose it.
         """
         request = ActionRequest.build(
-            observation, self.encoding, explore=explore, seed=seed, probabilities=probabilities, state=state
+            observation,
+            self.encoding,
+            explore=explore,
+            seed=seed,
+            probabilities=probabilities,
+            state=state,
+            deadline_ms=deadline_ms,
+            analysis=analysis,
         )
         return self.send(calls.act(parse_model(model), request))
 
@@ -102,6 +113,8 @@ class Client:
         seed: int | Sequence[int] | None = None,
         probabilities: bool = False,
         state: Sequence[str | None] | None = None,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
     ) -> BatchActionResponse:
         """Request the actions for a batch of observations; one version answers all of them.
 
@@ -112,12 +125,21 @@ class Client:
             seed: One seed for the batch, or one for each observation.
             probabilities: See `act`.
             state: Recurrent state of each observation.
+            deadline_ms: See `act`.
+            analysis: See `act`.
 
         Returns:
             The actions, in the order of the observations.
         """
         request = BatchActionRequest.build(
-            observations, self.encoding, explore=explore, seed=seed, probabilities=probabilities, state=state
+            observations,
+            self.encoding,
+            explore=explore,
+            seed=seed,
+            probabilities=probabilities,
+            state=state,
+            deadline_ms=deadline_ms,
+            analysis=analysis,
         )
         return self.send(calls.act_batch(parse_model(model), request))
 

@@ -59,12 +59,21 @@ class Episode:
         """Number of actions so far."""
         return self._steps
 
-    def act(self, observation: Any, *, probabilities: bool = False) -> Any:
+    def act(
+        self,
+        observation: Any,
+        *,
+        probabilities: bool = False,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
+    ) -> Any:
         """Request the next action.
 
         Args:
             observation: See `Client.act`.
             probabilities: Include the action probabilities in the response, which is available as `last`.
+            deadline_ms: See `Client.act`.
+            analysis: See `Client.act`. It is in the response, `last`.
 
         Returns:
             The action in the environment's format: an int or an array (float32 or int64).
@@ -80,6 +89,8 @@ class Episode:
             seed=None if self._seed is None else derive(self._seed, self._steps),
             probabilities=probabilities,
             state=self._last.state if self._last else None,
+            deadline_ms=deadline_ms,
+            analysis=analysis,
         )
         try:
             response = self._client.send(calls.act(self._model, request))

@@ -62,6 +62,8 @@ class Stream:
         explore: bool | None = None,
         seed: int | None = None,
         probabilities: bool = False,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
     ) -> Any:
         """Request the action for one observation.
 
@@ -71,6 +73,8 @@ class Stream:
             explore: See `Client.act`.
             seed: See `Client.act`.
             probabilities: Include the action probabilities in the response, which is available as `last`.
+            deadline_ms: See `Client.act`.
+            analysis: See `Client.act`. It is in the response, `last`.
 
         Returns:
             The action in the environment's format: an int or an array (float32 or int64).
@@ -80,7 +84,13 @@ class Stream:
             LeagueError: See `Client`.
         """
         request = ActionRequest.build(
-            observation, self._encoding, explore=explore, seed=seed, probabilities=probabilities
+            observation,
+            self._encoding,
+            explore=explore,
+            seed=seed,
+            probabilities=probabilities,
+            deadline_ms=deadline_ms,
+            analysis=analysis,
         )
         self._send(request, reset)
         assert isinstance(self.last, ActionResponse)
@@ -94,6 +104,8 @@ class Stream:
         explore: bool | None = None,
         seed: int | Sequence[int] | None = None,
         probabilities: bool = False,
+        deadline_ms: int | None = None,
+        analysis: bool = False,
     ) -> list[Any]:
         """Request the actions for a batch of observations.
 
@@ -103,6 +115,8 @@ class Stream:
             explore: See `Client.act`.
             seed: One seed for the batch, or one for each observation.
             probabilities: See `act`.
+            deadline_ms: See `act`.
+            analysis: See `act`.
 
         Returns:
             The actions, in the order of the observations.
@@ -111,7 +125,13 @@ class Stream:
             LeagueError: See `act`.
         """
         request = BatchActionRequest.build(
-            observations, self._encoding, explore=explore, seed=seed, probabilities=probabilities
+            observations,
+            self._encoding,
+            explore=explore,
+            seed=seed,
+            probabilities=probabilities,
+            deadline_ms=deadline_ms,
+            analysis=analysis,
         )
         self._send(request, reset if isinstance(reset, bool) else list(reset))
         assert isinstance(self.last, BatchActionResponse)

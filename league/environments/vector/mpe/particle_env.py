@@ -64,6 +64,10 @@ class ParticleEnv(VectorEnv):
         self._particles.update(env_ids, particles)
         return self._rows(env_ids, particles, self.rewards(particles), particles.steps >= self._max_cycles)
 
+    def copy(self, source: NDArray[np.int64], target: NDArray[np.int64]) -> None:
+        """See VectorEnv."""
+        self._particles.update(target, self._particles.copies(source))
+
     def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32]:
         """See VectorEnv. The state consists of the observations of all agents."""
         return self._observations(self._particles.copies(env_ids), range(self.world.num_agents))

@@ -13,11 +13,9 @@ from league.config.environment import EnvironmentConfig
 from league.environments.vector import leduc_holdem
 from league.environments.vector.equality import Comparison, DifferentialTest, compare
 from league.environments.vector.leduc import deals, rules
-from league.environments.vector.leduc.deals import deal, fast_deal
-from league.environments.vector.leduc.generators import Generators
+from league.environments.vector.leduc.deals import Generators, deal, fast_deal
 from league.environments.vector.leduc.rules import CALL, CHECK, FOLD, RAISE, Situation
-from league.environments.vector.leduc.tables import Start, tables
-from league.environments.vector.leduc_holdem import LeducHoldem
+from league.environments.vector.leduc_holdem import LeducHoldem, Start, tables
 from league.environments.vector.vector_env import AgentRows, UnsupportedArguments
 from league.spaces import ACTION_MASK, OBSERVATION
 

@@ -143,6 +143,8 @@ def test_matches_between_other_contestants_stay(used: Registry) -> None:
     plan = used.removal.remove_version(CheckpointRef(LEAGUE, 3), force=True)
     assert plan.matches == 2 + 2, "those of the verdict, and those of the version in the round robin"
     assert [match.contestants for match in ledger.matches(league=LEAGUE)] == [(f"{LEAGUE}@1", "script:random")]
+    assert ledger.recount(round_robin) == [], "the sums over the other matches are deleted"
+    assert ledger.counts(LEAGUE) == {round_robin.id: 1}
 
 
 def test_force_removes_the_champion_and_its_alias(used: Registry) -> None:
@@ -267,8 +269,8 @@ def test_a_member_of_a_mixture_is_not_removed_before_the_mixture(registry: Regis
     publish(registry, "run/2")
     mixture = registry.publisher.publish_mixture(LEAGUE, {1: 0.5, 2: 0.5})
     member = CheckpointRef(LEAGUE, 1)
-    assert f"it is a member of the mixture @{mixture.number}" in registry.removal.plan_version(member).reasons
-    with pytest.raises(Conflict, match=rf"{LEAGUE}@1 is a member of {mixture.ref}: remove the mixture first"):
+    assert f"it is a part of the mixture @{mixture.number}" in registry.removal.plan_version(member).reasons
+    with pytest.raises(Conflict, match=rf"{LEAGUE}@1 is a part of {mixture.ref}: remove that first"):
         registry.removal.remove_version(member, force=True)
     registry.removal.remove_version(CheckpointRef(LEAGUE, mixture.number))
     registry.removal.remove_version(member)

@@ -1,12 +1,13 @@
 """An SQLite file that is moved, restored or replaced while it is in use, and the timeouts of PostgreSQL."""
 
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from uuid import uuid4
 
 import psycopg
 import pytest
-from sqlalchemy import text
+from sqlalchemy import event, text
 
 from league.errors import StorageError
 from league.registry.registry import Registry
@@ -106,6 +107,20 @@ def test_a_transaction_does_not_wait_long_for_a_lock(server: str) -> None:
         with pytest.raises(StorageError, match="lock timeout"), database.write() as second:
             second.execute(lock)
     database.close()
+
+
+@pytest.mark.parametrize(("raised", "records"), [(SystemExit(15), 0), (KeyboardInterrupt(), 0), (ValueError(), 1)])
+def test_a_signal_while_a_connection_is_returned_is_not_logged(
+    local: Registry, caplog: pytest.LogCaptureFixture, raised: BaseException, records: int
+) -> None:
+    def reset(*_: object) -> None:
+        event.remove(local.database.engine, "reset", reset)
+        raise raised
+
+    event.listen(local.database.engine, "reset", reset)
+    with nullcontext() if records else pytest.raises(type(raised)):
+        local.leagues.names()
+    assert len(caplog.records) == records
 
 
 def test_a_full_disk_is_called_so(tmp_path: Path) -> None:

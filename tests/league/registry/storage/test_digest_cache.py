@@ -4,7 +4,7 @@ import hashlib
 import os
 from pathlib import Path
 
-from league.registry.storage.digest_cache import DigestCache
+from league.registry.storage.object_artifacts import DigestCache
 
 
 def _digest(content: bytes) -> str:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from league.errors import InvalidInput
-from league.registry.storage.mixture import Member, Mixture, episode_position, normalised
+from league.registry.storage.manifest import Member, Mixture, episode_position, normalised
 
 POSITIONS = 2000
 WEIGHTS = st.lists(st.floats(0.01, 1), min_size=2, max_size=6)

@@ -4,8 +4,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rlcard.utils import seeding
 
-from league.environments.vector.leduc import generators
-from league.environments.vector.leduc.generators import Generators, outputs
+from league.environments.vector.leduc import deals
+from league.environments.vector.leduc.deals import Generators, outputs
 
 SEEDS = st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=5)
 
@@ -27,7 +27,7 @@ def test_draws_equal_those_of_rlcards_generators(seeds: list[int], highest: list
 
 @pytest.mark.parametrize("num_outputs", [1, 3, 7])
 def test_more_outputs_are_computed_if_draws_need_them(num_outputs: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generators, "NUM_OUTPUTS", num_outputs)
+    monkeypatch.setattr(deals, "NUM_OUTPUTS", num_outputs)
     seeds = range(50)
     states = [seeding.np_random(seed)[0] for seed in seeds]
     drawing = Generators(np.array(seeds))

@@ -1,0 +1,121 @@
+"""How much stronger is a version of connect four with a search?
+
+Plays the champion of connect_four in LEAGUE_HOME, or the given version, with a search (PUCT) against itself without
+one and against scripts: greedy, from random openings of four plies, on both sides equally. A score counts a draw as
+half a win; bounds are the lower limits of 95 % intervals over matches of two games. Against `mcts_1000`, the number of
+simulations is that of the same processor time per move, measured before in single positions. Then the late positions
+of `decisive_positions`, and games of the champion of tictactoe against perfect play, from the empty board. Nothing is
+written to the ledger.
+"""
+
+from collections.abc import Iterator, Mapping
+from statistics import fmean, stdev
+from time import process_time
+from typing import Annotated
+
+import numpy as np
+import typer
+from scipy.stats import binomtest
+
+from benchmarks.decisive_positions import POSITIONS, decisive_positions
+from benchmarks.harness import Quick, Target
+from benchmarks.search import positions
+from evaluation.matches.worker import MatchWorker
+from evaluation.schedules.builders import round_robin
+from evaluation.statistics.sequential import elo_of
+from league.environments.vector.connect_four import ConnectFour
+from league.policies.loading import load
+from league.policies.policy import Policy
+from league.policies.scripted import script
+from league.refs import CheckpointRef
+from league.registry.registry import Registry
+from league.search.policies import SearchPolicy, search_policies
+
+GAMES, OPENING_PLIES, SIMULATIONS = 1000, 4, 100
+ELO, AGAINST_MINIMAX, AGAINST_MCTS = 220, 93.0, 60.0
+LATE_SIMULATIONS, KEPT, KEPT_LOW = 200, 97.5, 96.0
+TICTACTOE_GAMES, TICTACTOE_SIMULATIONS = 10_000, 50
+TIMED = 40
+"""Positions of which each takes one search when times are measured."""
+SEED = 0
+
+
+class Arena:
+    """Matches of a version with a search. opening_plies: random moves at the start."""
+
+    def __init__(self, ref: str, registry: Registry, opening_plies: int = OPENING_PLIES) -> None:
+        self._registry, self._base = registry, registry.versions.resolve(CheckpointRef.parse(ref))
+        row = registry.leagues.get(self._base.league)
+        play = row.config.play.model_copy(update={"opening_plies": opening_plies})
+        self._config, self.interface = row.config.model_copy(update={"play": play}), row.interface
+        self._worker = MatchWorker(self._config, registry)
+
+    @property
+    def base(self) -> str:
+        """The version without a search."""
+        return self._base.ref
+
+    def search(self, simulations: int) -> Mapping[str, SearchPolicy]:
+        """The policies of the version with a search, by id."""
+        environment = self._config.environment
+        return search_policies(self._base, "puct", simulations, self._registry, self.interface, environment)
+
+    def scores(self, simulations: int, opponent: str, games: int) -> list[float]:
+        """Mean score of the version with a search in each match against an opponent."""
+        policies = self.search(simulations)
+        guest = {agent: (policy, policies[policy]) for agent, policy in self.interface.policies.items()}
+        schedule = round_robin(self._config, self.interface, ["search", opponent], games // 2, SEED)
+        matches = self._worker.play(schedule, range(schedule.length), guests={"search": guest})
+        return [match.score(match.contestants.index("search")) for match in matches]
+
+    def score(self, simulations: int, opponent: str, games: int) -> tuple[float, float]:
+        """Mean score of the version with a search against an opponent, and its lower bound."""
+        scores = self.scores(simulations, opponent, games)
+        return fmean(scores), fmean(scores) - 1.96 * stdev(scores) / len(scores) ** 0.5
+
+
+def milliseconds(policy: Policy) -> float:
+    """Mean processor time of a move in single positions after six plies."""
+    (rows,) = positions(ConnectFour(TIMED), np.arange(TIMED))
+    began = process_time()
+    for row in range(TIMED):
+        observation = {name: array[row : row + 1] for name, array in rows.observations.items()}
+        policy.act(observation, rng=[np.random.default_rng([SEED, row])])
+    return 1000 * (process_time() - began) / TIMED
+
+
+def main(
+    ref: Annotated[str, typer.Argument()] = "connect_four@champion",
+    quick: Quick = False,
+    small: Annotated[str, typer.Option(help="the version of tic-tac-toe")] = "tictactoe@champion",
+) -> Iterator[Target]:
+    """Play, solve and count."""
+    scale = 10 if quick else 1
+    registry = Registry.open()
+    arena, games, number = Arena(ref, registry), GAMES // scale, POSITIONS // scale
+    score, low = arena.score(SIMULATIONS, arena.base, games)
+    note = f"{SIMULATIONS} simulations, {games} games, score {score:.1%}"
+    yield Target("Elo, lower bound", round(elo_of(low)), "Elo", at_least=ELO, peer="itself", note=note)
+    spaces = arena.interface.of_policy(arena.interface.policy_ids[0])
+    score, low = arena.score(SIMULATIONS, "script:minimax_4", games)
+    note = f"{SIMULATIONS} simulations, {games} games, score {score:.1%}"
+    yield Target("score, lower bound", round(100 * low, 2), "%", at_least=AGAINST_MINIMAX, peer="minimax_4", note=note)
+    allowed = milliseconds(script("mcts_1000", spaces.observation, spaces.action))
+    few, many = (milliseconds(next(iter(arena.search(count).values()))) for count in (SIMULATIONS, 4 * SIMULATIONS))
+    simulations = round(SIMULATIONS + 3 * SIMULATIONS * (allowed - few) / (many - few))
+    score, low = arena.score(simulations, "script:mcts_1000", games)
+    note = f"{simulations} simulations in {allowed:.1f} ms, {games} games, score {score:.1%}"
+    yield Target("score, lower bound", round(100 * low, 2), "%", at_least=AGAINST_MCTS, peer="mcts_1000", note=note)
+    late = decisive_positions(number, script("one_ply", spaces.observation, spaces.action))
+    kept = late.kept(next(iter(arena.search(LATE_SIMULATIONS).values())))
+    bound = binomtest(int(kept.sum()), number).proportion_ci(0.95, "wilson").low
+    plain = late.kept(load(arena.base, registry=registry)).mean()
+    note = f"{LATE_SIMULATIONS} simulations, {number} positions; {plain:.1%} without a search"
+    name = "late outcomes kept"
+    yield Target(name, round(100 * kept.mean(), 2), "%", at_least=KEPT, note=note)
+    yield Target(f"{name}, lower bound", round(100 * bound, 2), "%", at_least=KEPT_LOW, note=note)
+    games = TICTACTOE_GAMES // scale
+    scores = Arena(small, registry, opening_plies=0).scores(TICTACTOE_SIMULATIONS, "script:solver", games)
+    note = f"{TICTACTOE_SIMULATIONS} simulations, {games} games"
+    lost = sum(score < 0.5 for score in scores)
+    yield Target("tic-tac-toe losses", lost, at_most=0, peer="the solver", note=note)

@@ -1,0 +1,1 @@
+"""Games that run in simulators, which connect to a gateway of the process that needs episodes."""

@@ -1,0 +1,94 @@
+"""Gumbel's sequential halving: Danihelka et al., 2022, "Policy improvement by planning with Gumbel".
+
+At the root, the actions with the highest g + logits are considered, where g is Gumbel noise, or 0 in a search without
+noise. Simulations are distributed evenly; in each phase the better half remains, by g + logits + σ(q). Below the root,
+an action is selected such that visits follow the improved policy π' = softmax(logits + σ(q)). σ(q) is
+(50 + the most visits) · (1 + q) / 2: the paper's constants, for values from -1 to 1. Actions without visits have the
+value of equation 33 of the paper.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from league.policies.draws import Generators
+from league.search.tree import ILLEGAL, Nodes, row_maxima, row_sums
+
+MOST_CONSIDERED = 16
+"""Actions that are considered at the root, at most."""
+VISIT_OFFSET = np.float32(50)
+LAST = np.float32(2**20)
+"""The negative score of an action of the root that a round does not visit."""
+
+
+class SequentialHalving:
+    """Selects actions as in Gumbel AlphaZero. A search has as much noise as its generators give."""
+
+    def start(self, roots: Nodes, simulations: int, leaves: int, rng: Generators | None) -> NDArray[np.int64]:
+        """See Rule."""
+        count, actions = roots.logits.shape
+        self._noise: NDArray[np.float32] = np.zeros((count, actions), dtype=np.float32)
+        if rng is not None:
+            self._noise[:] = [generator.gumbel(size=actions) for generator in rng]
+        considered = np.minimum((roots.logits > ILLEGAL).sum(axis=1), MOST_CONSIDERED)
+        numbers, kinds = np.unique(considered, return_inverse=True)
+        schedules = [halving(number, simulations, leaves) for number in numbers.tolist()]
+        table = np.zeros((len(numbers), max(map(len, schedules)), 2), dtype=np.int64)
+        for kind, schedule in enumerate(schedules):
+            table[kind, : len(schedule)] = schedule
+        sizes, self._visits = table[kinds].transpose(2, 0, 1)
+        """Visits of the actions of the root that each round takes, (k, rounds)."""
+        return sizes
+
+    def scores(self, nodes: Nodes, roots: int, number: int, leaves: int) -> NDArray[np.float32]:
+        """See Rule."""
+        sent = np.arange(leaves, dtype=np.float32)[:, np.newaxis, np.newaxis]
+        logits = improved_logits(nodes)
+        policy = np.exp(logits - row_maxima(logits))
+        policy /= row_sums(policy)
+        scores = policy - (nodes.visits + sent) / (1 + nodes.total_visits)[:, np.newaxis]
+        is_next = nodes.visits[:roots] == self._visits[:, number, np.newaxis]
+        values = np.maximum(logits[:roots] + self._noise, 1 - LAST)
+        scores[:, :roots] = np.where(is_next & (sent == 0), values, -LAST)
+        return scores
+
+    def result(self, roots: Nodes) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """See Rule. The best action is that of the most visited ones with the highest score."""
+        logits = improved_logits(roots)
+        is_most = roots.visits == row_maxima(roots.visits)
+        actions = np.where(is_most, logits + self._noise, -np.inf).argmax(axis=1)
+        return actions, np.where(roots.logits > ILLEGAL, logits, ILLEGAL)
+
+
+def improved_logits(nodes: Nodes) -> NDArray[np.float32]:
+    """Return logits + σ(q), (k, actions); unspecified for illegal actions."""
+    is_visited = nodes.visits > 0
+    priors = np.where(is_visited, np.exp(nodes.logits), np.float32(0))
+    means = nodes.sums / np.maximum(nodes.visits, 1)
+    # Equation 33: the node's evaluation, and the mean of the visited actions, weighted by their priors.
+    weighted = row_sums(priors * means) / np.maximum(row_sums(priors), np.finfo(np.float32).tiny)
+    visits = nodes.total_visits[:, np.newaxis]
+    mixed = (nodes.value[:, np.newaxis] + visits * weighted) / (1 + visits)
+    values = np.where(is_visited, means, mixed)
+    return nodes.logits + (VISIT_OFFSET + row_maxima(nodes.visits)) / 2 * (1 + values)
+
+
+def halving(considered: int, simulations: int, leaves: int) -> list[tuple[int, int]]:
+    """Return for each round its simulations, and the visits that the actions must have among which it takes the best.
+
+    There are ⌈log₂ considered⌉ phases with equally many simulations. After the last one, the best two actions remain.
+    A round visits each of the remaining actions once, up to `leaves` of them: these are different edges of the root, so
+    no simulation depends on another one of its round.
+    """
+    phases = max(1, math.ceil(math.log2(considered)))
+    rounds: list[tuple[int, int]] = []
+    visits, remaining, left = 0, considered, simulations
+    while left:
+        for _ in range(max(1, simulations // (phases * remaining))):
+            for first in range(0, min(left, remaining), leaves):
+                rounds.append((min(leaves, remaining - first, left), visits))
+                left -= rounds[-1][0]
+            visits += 1
+        remaining = max(min(2, considered), remaining // 2)
+    return rounds

@@ -1,0 +1,1 @@
+"""Networks and callbacks to start from: docs/extending.md."""

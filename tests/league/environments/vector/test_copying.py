@@ -1,0 +1,119 @@
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from league.config.environment import EnvironmentConfig
+from league.environments.building import agent_interface, build
+from league.environments.implementation import VECTORISED, implementation
+from league.environments.vector.connect_four import ConnectFour
+from league.environments.vector.copying import Twins
+from league.environments.vector.differences import EnvironmentsDiffer
+from league.environments.vector.tictactoe import TicTacToe
+from league.environments.vector.vector_env import AgentRows, VectorEnv
+from league.errors import ObservationError
+from league.spaces import Discrete
+
+
+def twins(config: EnvironmentConfig) -> Twins:
+    vector, env = implementation(config).vector, build(config)
+    assert vector is not None
+    actions = [agent_interface(env, agent).action for agent in env.possible_agents]
+    env.close()
+    return Twins(partial(vector, **config.kwargs), actions)
+
+
+@pytest.mark.parametrize("entry_point", VECTORISED)
+def test_copied_episodes_continue_identically(entry_point: str) -> None:
+    twins(EnvironmentConfig(entry_point=entry_point)).check_copying()
+
+
+def test_copied_episodes_continue_identically_with_wrappers() -> None:
+    wrappers: list[Any] = [{"frame_stack_v1": {"stack_size": 3}}]
+    twins(
+        EnvironmentConfig.model_validate({"entry_point": "mpe2.simple_spread_v3", "wrappers": wrappers})
+    ).check_copying()
+
+
+@pytest.mark.parametrize(("game", "actions"), [(ConnectFour, 7), (TicTacToe, 9)])
+def test_board_games_are_restored_from_observations(game: type[VectorEnv], actions: int) -> None:
+    Twins(game, [Discrete(n=actions)] * 2).check_restoring()
+
+
+class Faulty(TicTacToe):
+    """Has an error in some attribute of restored and copied episodes, or in the outcome of a seed."""
+
+    def __init__(self, num_envs: int, attribute: str) -> None:
+        super().__init__(num_envs)
+        self._attribute = attribute
+
+    def copy(self, source: NDArray[np.int64], target: NDArray[np.int64]) -> None:
+        before = getattr(self, self._attribute)[target].copy()
+        super().copy(source, target)
+        getattr(self, self._attribute)[target] = before
+
+    def restore(self, env_ids: NDArray[np.int64], observations: Mapping[str, NDArray[Any]]) -> Sequence[AgentRows]:
+        before = getattr(self, self._attribute)[env_ids].copy()
+        rows = super().restore(env_ids, observations)
+        getattr(self, self._attribute)[env_ids] = before
+        return rows
+
+
+@pytest.mark.parametrize("attribute", ["_planes", "_masks", "_moves", "_boards"])
+@pytest.mark.parametrize(
+    ("check", "other"), [(Twins.check_copying, "the copied episode"), (Twins.check_restoring, "the restored episode")]
+)
+def test_each_part_of_the_state_is_compared(attribute: str, check: Callable[[Twins], None], other: str) -> None:
+    with pytest.raises(EnvironmentsDiffer, match=rf"(copy|row) .* in {other}"):
+        check(Twins(lambda copies: Faulty(copies, attribute), [Discrete(n=9)] * 2))
+
+
+class Chance(TicTacToe):
+    """The seed decides which player's win counts after the fourth move."""
+
+    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
+        self._seeds = getattr(self, "_seeds", np.zeros(self.num_envs, dtype=np.int64))
+        self._seeds[env_ids] = seeds
+        return super().reset(env_ids, seeds)
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
+        (rows,) = super().step(env_ids, actions)
+        rows.rewards[:] *= np.where(self._seeds[rows.envs] % 2 == 0, 1, -1)
+        return (rows,)
+
+
+def test_games_of_chance_are_recognised() -> None:
+    Twins(TicTacToe, [Discrete(n=9)] * 2).check_without_chance()
+    Twins(Chance, [Discrete(n=9)] * 2).check_copying()
+    with pytest.raises(EnvironmentsDiffer, match=r"rewards is .* in the episode with another seed"):
+        Twins(Chance, [Discrete(n=9)] * 2).check_without_chance()
+
+
+def board(game: type[TicTacToe] | type[ConnectFour], own: list[int], other: list[int]) -> NDArray[np.int8]:
+    shape = (3, 3, 2) if game is TicTacToe else (6, 7, 2)
+    planes = np.zeros((shape[0] * shape[1], 2), dtype=np.int8)
+    planes[own, 0] = planes[other, 1] = 1
+    return planes.reshape(1, *shape)
+
+
+@pytest.mark.parametrize(
+    ("game", "own", "other"),
+    [
+        (TicTacToe, [0, 1], [2]),  # the other player must move
+        (TicTacToe, [0], [1, 2, 3]),
+        (TicTacToe, [0], [0]),
+        (TicTacToe, [3, 4], [0, 1, 2]),  # lost
+        (TicTacToe, [0, 2, 5, 7], [1, 4, 3, 6, 8]),  # full
+        (ConnectFour, [], [0]),  # hovers
+        (ConnectFour, [35, 36, 37], [28, 29, 30, 31]),
+        (ConnectFour, [28, 29, 30], [35, 36, 37, 38]),
+    ],
+)
+def test_what_is_not_a_position_is_refused(
+    game: type[TicTacToe] | type[ConnectFour], own: list[int], other: list[int]
+) -> None:
+    with pytest.raises(ObservationError, match=r"observation 0 is not a position .*: \d own pieces and \d of"):
+        game(1).restore(np.array([0]), {"observation": board(game, own, other)})

@@ -1,0 +1,106 @@
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from league.config.league import LeagueConfig
+from league.environments.building import build, describe
+from league.environments.vector.connect_four import ConnectFour
+from league.environments.vector.vector_env import AgentRows, VectorEnv
+from league.errors import EnvironmentMismatch
+from league.search.requirements import searchable
+
+
+def check(entry_point: str, **settings: object) -> Callable[[int], VectorEnv]:
+    config = LeagueConfig.model_validate(
+        {"league": "any", "environment": {"entry_point": entry_point, **settings}, "training": {"algorithm": "ppo"}}
+    )
+    return searchable(config.environment, describe(build(config.environment), config))
+
+
+@pytest.mark.parametrize("name", ["connect_four_v3", "tictactoe_v3"])
+def test_games_with_perfect_information_can_be_searched(name: str) -> None:
+    make = check(f"pettingzoo.classic.{name}")
+    assert make(3).num_envs == 3
+
+
+@pytest.mark.parametrize(
+    ("entry_point", "reason"),
+    [
+        ("pettingzoo.classic.leduc_holdem_v4", "agents do not see everything"),
+        ("pettingzoo.classic.rps_v2", "agents do not see everything"),
+        ("mpe2.simple_spread_v3", "agents do not see everything"),
+        ("pettingzoo.classic.go_v5", "only vectorised environments can be searched. It is stepped in lockstep"),
+    ],
+)
+def test_others_are_refused_with_the_reason(entry_point: str, reason: str) -> None:
+    with pytest.raises(EnvironmentMismatch, match=f"{entry_point} cannot be searched: {reason}") as refused:
+        check(entry_point)
+    assert "\n" not in str(refused.value)
+
+
+class Forgetful(ConnectFour):
+    """Keeps a part of its state where `copy` does not expect it."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        self._kept = [self._boards]
+        del self._boards
+
+    def __getattr__(self, name: str) -> object:
+        if name == "_boards":
+            return self._kept[0]
+        raise AttributeError(name)
+
+
+def test_an_environment_that_copies_too_little_is_refused() -> None:
+    vector = f"{Forgetful.__module__}:Forgetful"
+    with pytest.raises(EnvironmentMismatch, match=r"its VectorEnv\.copy does not copy everything: (copy|row) "):
+        check("pettingzoo.classic.connect_four_v3", vector=vector)
+
+
+class Unrestored(ConnectFour):
+    """Does not implement `restore`."""
+
+    restore = VectorEnv.restore
+
+
+class Doubled(ConnectFour):
+    """A win counts 2."""
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[np.int64]) -> Sequence[AgentRows]:
+        (rows,) = super().step(env_ids, actions)
+        rows.rewards[:] *= 2
+        return (rows,)
+
+
+@pytest.mark.parametrize(
+    ("game", "reason"), [(Unrestored, r"does not implement VectorEnv\.restore"), (Doubled, "not from -1 to 1")]
+)
+def test_a_game_that_search_versions_cannot_play_is_refused(game: type[ConnectFour], reason: str) -> None:
+    with pytest.raises(EnvironmentMismatch, match=reason):
+        check("pettingzoo.classic.connect_four_v3", vector=f"{game.__module__}:{game.__name__}")
+
+
+class Chance(ConnectFour):
+    """The seed decides whose win counts."""
+
+    def __init__(self, num_envs: int) -> None:
+        super().__init__(num_envs)
+        self._signs = np.ones(num_envs)
+
+    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
+        self._signs[env_ids] = 1 - 2 * (seeds % 2)
+        return super().reset(env_ids, seeds)
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[np.int64]) -> Sequence[AgentRows]:
+        (rows,) = super().step(env_ids, actions)
+        rows.rewards[:] *= self._signs[rows.envs]
+        return (rows,)
+
+
+def test_a_game_of_chance_is_refused() -> None:
+    vector = f"{Chance.__module__}:Chance"
+    with pytest.raises(EnvironmentMismatch, match=r"cannot be searched: its games depend on chance: copy \d+, seed "):
+        check("pettingzoo.classic.connect_four_v3", vector=vector)

@@ -1,0 +1,308 @@
+"""Games are searched without knowledge: all actions are equally likely, and all positions worth 0."""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from random import Random
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from league.environments.vector.connect_four import ConnectFour
+from league.environments.vector.tictactoe import TicTacToe
+from league.environments.vector.vector_env import AgentRows, VectorEnv
+from league.policies.line_games.game import TIC_TAC_TOE
+from league.policies.line_games.solver import LineGameSolver
+from league.search.gumbel import SequentialHalving
+from league.search.puct import PUCT
+from league.search.tree import LEAVES, Estimates, Nodes, Rule, Search, SearchResult
+from league.spaces import ACTION_MASK, OBSERVATION
+
+RULES: dict[str, Callable[[], Rule]] = {"PUCT": PUCT, "sequential halving": SequentialHalving}
+ACTIONS = {TicTacToe: 9, ConnectFour: 7}
+
+
+def uniform(rows: AgentRows) -> Estimates:
+    mask = rows.observations[ACTION_MASK]
+    return Estimates(np.zeros(mask.shape, np.float32), np.zeros((len(mask), 2), np.float32))
+
+
+def hashed(rows: AgentRows) -> Estimates:
+    """Arbitrary numbers that depend on the position only."""
+    boards = rows.observations[OBSERVATION].reshape(len(rows.envs), -1)
+    weights = np.random.default_rng(0).normal(size=(boards.shape[1], ACTIONS[ConnectFour] + 1)).astype(np.float32)
+    numbers = np.sin((boards[:, :, np.newaxis] * weights).sum(axis=1) * 3)
+    values = np.stack([numbers[:, -1], -numbers[:, -1]], axis=1)
+    values[rows.agents == 1] *= -1
+    return Estimates(2 * numbers[:, :-1], values)
+
+
+def searched(
+    game: type[TicTacToe] | type[ConnectFour],
+    games: Sequence[Sequence[int]],
+    rule: Rule,
+    simulations: int,
+    evaluate: Callable[[AgentRows], Estimates] = uniform,
+    seed: int | None = None,
+    leaves: int = LEAVES,
+) -> SearchResult:
+    """Search from the positions after some games."""
+    search = Search(
+        game, evaluate, rule, games=len(games), simulations=simulations, num_actions=ACTIONS[game], leaves=leaves
+    )
+    rows = [positions(search.env, search.roots, games)]
+    rng = None if seed is None else [np.random.default_rng([seed, *actions]) for actions in games]
+    return search.run(rows, rng)
+
+
+def positions(env: VectorEnv, copies: NDArray[np.int64], games: Sequence[Sequence[int]]) -> AgentRows:
+    rows = env.reset(copies, np.zeros(len(copies), dtype=np.int64))[0]
+    for copy, actions in zip(copies, games, strict=True):
+        for action in actions:
+            (row,) = env.step(np.array([copy]), np.array([action]))
+            assert not row.has_ended.any(), "a position in which a player must move"
+            place = rows.envs == copy
+            for name, observation in row.observations.items():
+                rows.observations[name][place] = observation
+            rows.agents[place] = row.agents
+    return rows
+
+
+@pytest.fixture(params=RULES)
+def rule_name(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+def test_a_mate_in_one_is_played(rule_name: str) -> None:
+    result = searched(TicTacToe, [(0, 3, 1, 4), (0, 3, 1, 4, 8)], RULES[rule_name](), 50)
+    assert result.actions.tolist() == [2, 5]
+    assert (result.values > 0).all()
+
+
+def test_the_value_of_a_finished_game_is_exact(rule_name: str) -> None:
+    """The only legal move wins, or draws. The position itself was evaluated as 0."""
+    result = searched(TicTacToe, [(0, 1, 2, 4, 5, 3, 7, 6), (0, 1, 2, 4, 7, 3, 5, 8)], RULES[rule_name](), 49)
+    assert result.actions.tolist() == [8, 6]
+    assert result.values.tolist() == [np.float32(49 / 50), 0]
+
+
+def test_a_threat_is_parried_in_connect_four(rule_name: str) -> None:
+    assert searched(ConnectFour, [(0, 6, 0, 6, 0), (3, 0, 3, 1, 3)], RULES[rule_name](), 200).actions.tolist() == [0, 3]
+
+
+def test_a_mate_in_two_is_played(rule_name: str) -> None:
+    """Tic-tac-toe: a fork. Connect four: three in the bottom row with both ends open."""
+    assert searched(TicTacToe, [(0, 1, 3, 6)], RULES[rule_name](), 400).actions[0] in (4,)
+    assert searched(ConnectFour, [(2, 2, 3, 3)], RULES[rule_name](), 1000).actions[0] in (1, 4)
+
+
+games_of_connect_four = st.lists(st.lists(st.integers(0, 6), max_size=6), min_size=1, max_size=5)
+
+
+@settings(max_examples=15, deadline=None)
+@given(games_of_connect_four, st.integers(1, 40), st.sampled_from(sorted(RULES)), st.booleans())
+def test_all_simulations_visit_legal_actions(
+    games: list[list[int]], simulations: int, rule_name: str, has_noise: bool
+) -> None:
+    games.append([0, 0, 0, 0, 0, 0])  # a full column
+    result = searched(ConnectFour, games, RULES[rule_name](), simulations, hashed, 3 if has_noise else None)
+    assert (result.visits.sum(axis=1) == simulations).all()
+    assert result.visits[-1, 0] == 0
+    assert result.actions[-1] != 0
+    assert (result.logits[-1, 0] < result.logits[-1, result.actions[-1]]).all()
+    assert (np.abs(result.values) <= 1).all()
+
+
+@settings(max_examples=15, deadline=None)
+@given(games_of_connect_four, st.integers(1, 40), st.sampled_from(sorted(RULES)), st.randoms())
+def test_the_result_of_a_game_depends_neither_on_the_others_nor_on_their_order(
+    games: list[list[int]], simulations: int, rule_name: str, random: Random
+) -> None:
+    together = searched(ConnectFour, games, RULES[rule_name](), simulations, hashed, seed=5)
+    order = list(range(len(games)))
+    random.shuffle(order)
+    shuffled = searched(ConnectFour, [games[i] for i in order], RULES[rule_name](), simulations, hashed, seed=5)
+    alone = searched(ConnectFour, games[:1], RULES[rule_name](), simulations, hashed, seed=5)
+    assert (shuffled.visits == together.visits[order]).all()
+    assert (shuffled.actions == together.actions[order]).all()
+    assert (shuffled.values == together.values[order]).all()
+    assert (alone.visits == together.visits[:1]).all()
+    assert (alone.logits == together.logits[:1]).all()
+
+
+def test_a_search_can_be_repeated_and_its_nodes_reused(rule_name: str) -> None:
+    search = Search(ConnectFour, hashed, RULES[rule_name](), games=2, simulations=60, num_actions=7)
+    first = search.run([positions(search.env, search.roots, [(3, 3), (0,)])])
+    other = search.run([positions(search.env, search.roots[:1], [(6, 5, 4)])])
+    again = search.run([positions(search.env, search.roots, [(3, 3), (0,)])])
+    assert (first.visits == again.visits).all()
+    assert (first.values == again.values).all()
+    assert (other.visits == searched(ConnectFour, [(6, 5, 4)], RULES[rule_name](), 60, hashed).visits).all()
+
+
+@pytest.mark.slow
+def test_tictactoe_is_never_lost_against_the_solver() -> None:
+    """The opponent tries every move that keeps the best outcome, from both sides."""
+    solver = LineGameSolver(TIC_TAC_TOE)
+    games: list[tuple[int, ...]] = [(), *((first,) for first in range(9))]
+    while games:
+        result = searched(TicTacToe, games, PUCT(), 3000)
+        following = []
+        for moved in ((*game, action) for game, action in zip(games, result.actions.tolist(), strict=True)):
+            rows = played(TicTacToe, moved)
+            if rows.has_ended.any():
+                continue
+            outcomes = solver.outcomes(*solver.position(rows.observations[OBSERVATION][0]))
+            assert max(outcomes.values()) <= 0, f"{moved} loses"
+            answers = [(*moved, answer) for answer, outcome in outcomes.items() if outcome == max(outcomes.values())]
+            following += [answer for answer in answers if not played(TicTacToe, answer).has_ended.any()]
+        games = following
+
+
+def played(game: type[TicTacToe] | type[ConnectFour], actions: Sequence[int]) -> AgentRows:
+    env, copy = game(1), np.array([0])
+    rows = env.reset(copy, copy)[0]
+    for action in actions:
+        (rows,) = env.step(copy, np.array([action]))
+    return rows
+
+
+@pytest.mark.parametrize("noise", [False, True])
+@pytest.mark.parametrize(("considered", "simulations"), [(7, 12), (7, 32), (7, 100), (6, 41)])
+@pytest.mark.parametrize("leaves", [1, LEAVES])
+def test_sequential_halving_equals_a_plain_search(noise: bool, considered: int, simulations: int, leaves: int) -> None:
+    game = (0,) * 6 if considered == 6 else (3, 2)
+    result = searched(ConnectFour, [game], SequentialHalving(), simulations, hashed, 1 if noise else None, leaves)
+    gumbel = np.random.default_rng([1, *game]).gumbel(size=7) if noise else np.zeros(7)
+    visits, action = plain_search(game, simulations, gumbel, leaves)
+    assert result.visits[0].tolist() == visits
+    assert result.actions[0] == action
+
+
+class PlainNode:
+    """A position of connect four, one Python object each."""
+
+    def __init__(self, actions: tuple[int, ...]) -> None:
+        rows = played(ConnectFour, actions)
+        self.actions, self.player = actions, len(actions) % 2
+        self.children: dict[int, PlainNode] = {}
+        self.is_over = bool(rows.has_ended.any())
+        if self.is_over:
+            self.values = dict(zip(rows.agents.tolist(), rows.rewards.tolist(), strict=True))
+            return
+        logits, values = hashed(rows)
+        self.values = dict(enumerate(values[0].tolist()))
+        self.legal = np.flatnonzero(rows.observations[ACTION_MASK][0]).tolist()
+        shares = np.exp(logits[0][self.legal].astype(float))
+        self.priors = dict(zip(self.legal, (shares / shares.sum()).tolist(), strict=True))
+        self.returns: dict[int, list[float]] = {action: [] for action in self.legal}
+
+    def simulate(self, action: int) -> dict[int, float]:
+        if action in self.children:
+            child = self.children[action]
+            values = child.values if child.is_over else child.simulate(child.next_action())
+        else:
+            child = self.children[action] = PlainNode((*self.actions, action))
+            values = child.values
+        self.returns[action].append(values[self.player])
+        return values
+
+    def puct(self, sent: Counter[tuple["PlainNode", int]]) -> int:
+        mean = (self.values[self.player] + sum(map(sum, self.returns.values()))) / (1 + self.count())
+
+        def score(action: int) -> float:
+            lost, visits = sent[self, action], len(self.returns[action])
+            total = sum(self.returns[action]) if visits else mean
+            exploration = 1.5 * self.priors[action] * math.sqrt(1 + self.count()) / (1 + visits + lost)
+            return (total - lost) / (max(visits, 1) + lost) + exploration
+
+        return max(self.legal, key=score)
+
+    def count(self) -> int:
+        return sum(map(len, self.returns.values()))
+
+    def improved(self) -> dict[int, float]:
+        """Logits + σ(completed q)."""
+        visited = [action for action in self.legal if self.returns[action]]
+        mean = {action: sum(self.returns[action]) / len(self.returns[action]) for action in visited}
+        mixed = self.values[self.player]
+        if visited:
+            weights = sum(self.priors[action] for action in visited)
+            average = sum(self.priors[action] * mean[action] for action in visited) / weights
+            mixed = (mixed + self.count() * average) / (1 + self.count())
+        scale = 50 + max(map(len, self.returns.values()))
+        return {
+            action: math.log(self.priors[action]) + scale * (1 + mean.get(action, mixed)) / 2 for action in self.legal
+        }
+
+    def next_action(self) -> int:
+        improved = self.improved()
+        highest = max(improved.values())
+        total = sum(math.exp(logit - highest) for logit in improved.values())
+        return max(
+            self.legal,
+            key=lambda action: (
+                math.exp(improved[action] - highest) / total - len(self.returns[action]) / (1 + self.count())
+            ),
+        )
+
+
+def plain_search(
+    game: tuple[int, ...], simulations: int, gumbel: NDArray[np.float64], leaves: int
+) -> tuple[list[int], int]:
+    """Sequential halving, phase by phase."""
+    root = PlainNode(game)
+
+    def score(action: int) -> float:
+        return float(gumbel[action]) + root.improved()[action]
+
+    remaining = sorted(root.legal, key=score, reverse=True)
+    phases = math.ceil(math.log2(len(remaining)))
+    while root.count() < simulations:
+        for _ in range(max(1, simulations // (phases * len(remaining)))):
+            # All of them once, the best ones first, in case that the simulations do not suffice.
+            waiting = list(remaining)
+            while waiting and (left := simulations - root.count()):
+                best = sorted(waiting, key=score, reverse=True)[: min(leaves, left)]
+                waiting = [action for action in waiting if action not in best]
+                for action in best:
+                    root.simulate(action)
+        remaining = sorted(remaining, key=score, reverse=True)[: max(2, len(remaining) // 2)]
+    visits = [len(root.returns.get(action, ())) for action in range(7)]
+    most = [action for action in root.legal if visits[action] == max(visits)]
+    return visits, max(most, key=score)
+
+
+@pytest.mark.parametrize("game", [(), (3, 2, 3), (0, 0, 0, 0, 0, 0), (0, 1, 0, 1, 0, 1)])
+@pytest.mark.parametrize(("simulations", "leaves"), [(60, 1), (60, 5), (200, LEAVES)])
+def test_puct_equals_a_plain_search(game: tuple[int, ...], simulations: int, leaves: int) -> None:
+    """The plain search walks from the root once for each simulation, and counts those of its round as losses."""
+    root = PlainNode(game)
+    sizes = PUCT().start(Nodes(*np.zeros((6, 1, 7), dtype=np.float32)), simulations, leaves, None)[0].tolist()
+    for size in sizes:
+        sent: Counter[tuple[PlainNode, int]] = Counter()
+        paths = []
+        for _ in range(size):
+            node, path = root, list[tuple[PlainNode, int]]()
+            while not node.is_over:
+                action = node.puct(sent)
+                path.append((node, action))
+                sent[node, action] += 1
+                if action not in node.children:
+                    break
+                node = node.children[action]
+            paths.append(path)
+        for path in paths:
+            node, action = path[-1]
+            if action not in node.children:
+                node.children[action] = PlainNode((*node.actions, action))
+        for path in paths:
+            values = path[-1][0].children[path[-1][1]].values
+            for node, action in path:
+                node.returns[action].append(values[node.player])
+    result = searched(ConnectFour, [game], PUCT(), simulations, hashed, leaves=leaves)
+    assert result.visits[0].tolist() == [len(root.returns.get(action, ())) for action in range(7)]
+    assert max(sizes) == min(leaves, simulations // 4)

@@ -1,0 +1,87 @@
+"""Observations encoded as JSON are decoded to the same arrays."""
+
+from typing import Any
+
+import numpy as np
+import orjson
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from league.errors import ObservationError
+from league.spaces import Box, DictSpace, Discrete, MultiBinary, Space
+from league.spaces.arrays import tensors
+from league.spaces.observation_codec import ObservationReader, read_state, reject_strings
+
+GRID = Box(dtype="uint8", shape=(2, 3), low=0, high=255)
+SPEED = Box(dtype="float32", shape=(2,), low=None, high=None)
+MASK = Box(dtype="int8", shape=(3,), low=0, high=1)
+SPACES: dict[str, Space] = {
+    "leaf": GRID,
+    "masked": DictSpace(spaces={"action_mask": MASK, "observation": GRID}),
+    "masked and nested": DictSpace(
+        spaces={"observation": DictSpace(spaces={"grid": GRID, "speed": SPEED}), "action_mask": MASK}
+    ),
+    "nested": DictSpace(spaces={"a": DictSpace(spaces={"b": GRID, "c": Discrete(n=4)}), "d": MultiBinary(shape=(2,))}),
+}
+
+
+def values(space: Space) -> st.SearchStrategy[Any]:
+    match space:
+        case DictSpace():
+            return st.fixed_dictionaries({key: values(part) for key, part in space.spaces.items()})
+        case Discrete():
+            return st.integers(space.start, space.start + space.n - 1)
+        case MultiBinary():
+            return arrays(np.int8, space.shape, elements=st.integers(0, 1))
+        case Box(shape=(3,)):
+            masks = arrays(np.int8, space.shape, elements=st.integers(0, 1))
+            return masks.filter(lambda mask: mask.any())
+        case Box(dtype="float32"):
+            return arrays(np.float32, space.shape, elements=st.floats(width=32, allow_nan=False, allow_infinity=False))
+    return arrays(space.dtype, space.shape)
+
+
+@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_observations_survive_json(space: Space, data: st.DataObject) -> None:
+    batch = data.draw(st.lists(values(space), min_size=1, max_size=3))
+    document = orjson.loads(orjson.dumps(batch, option=orjson.OPT_SERIALIZE_NUMPY))
+    found = ObservationReader(space).read(document)
+    expected = [tensors(space, value) for value in batch]
+    assert found.keys() == expected[0].keys()
+    for name, array in found.items():
+        assert array.dtype == expected[0][name].dtype
+        np.testing.assert_array_equal(array, np.stack([row[name] for row in expected]))
+
+
+@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
+def test_zeros_are_valid_observations(space: Space) -> None:
+    reader = ObservationReader(space)
+    zeros = reader.zeros(2)
+    assert {array.shape[0] for array in zeros.values()} == {2}
+    if "action_mask" in zeros:
+        assert zeros["action_mask"].all()
+
+
+@pytest.mark.parametrize(
+    ("space", "keys"), [("leaf", 0), ("masked", 2), ("masked and nested", 4), ("nested", 4)], ids=lambda v: str(v)
+)
+def test_keys_counts_the_keys_of_an_observation(space: str, keys: int) -> None:
+    assert ObservationReader(SPACES[space]).keys == keys
+
+
+def test_nested_strings_are_found() -> None:
+    reject_strings({"a": [1, [2.5, None, {"b": True}]]})
+    with pytest.raises(ObservationError, match="'deep'"):
+        reject_strings({"a": [1, [2, {"b": "deep"}]]})
+
+
+def test_state_has_a_row_for_each_observation() -> None:
+    leaves = [("state_in_0", SPEED)]
+    assert read_state({"state_in_0": [[1, 2], [3, 4]]}, leaves, 2)["state_in_0"].shape == (2, 2)
+    for invalid in (None, {}, {"state_in_0": [[1, 2]]}, {"state_in_0": [1, 2]}, {"state_in_1": [[1, 2]] * 2}):
+        with pytest.raises(ObservationError, match="state"):
+            read_state(invalid, leaves, 2)

@@ -1,0 +1,382 @@
+"""The fast path of the action route answers as the application does."""
+
+import asyncio
+import gc
+import random
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.load.http import JSON
+from league.errors import GraphTimeout, Overloaded
+from league.registry.registry import Registry
+from league.registry.storage.rows import Portion
+from league.settings import Storage
+from serve_app.access.load_shedding import Backlog
+from serve_app.app import Replica
+from serve_app.routes import plain_action
+from serve_app.routes.plain_action import PlainActions
+from serve_app.runtime.uvicorn_http import HttpProtocol
+from tests.support.clients.actions import BAD_BODIES, BOARD, boards
+from tests.support.leagues.served_leagues import everything, promote
+from tests.support.servers.replicas import QUICK, READ_ONLY
+from tests.support.servers.shadows import set_shadow, wait_for
+from tests.support.servers.two_paths import (
+    Connections,
+    binary_boards,
+    changing,
+    differences,
+    exchange,
+    infer,
+    receive,
+    request,
+    together,
+)
+from tests.support.waiting import until
+
+VECTOR = {"observation": [0.25, -0.5]}
+NESTED = {"observation": {"mode": 2, "sense": {"speed": [1.5, 2]}}}
+
+
+@pytest.fixture(scope="module")
+def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Connections]:
+    storage = Storage.at(tmp_path_factory.mktemp("plain") / "home")
+    everything(storage).close()
+    with Connections(Replica(Registry.open(storage), READ_ONLY, "replica-1")) as connections:
+        until(lambda: connections.server.alias_slots.champion("board") is not None)
+        yield connections
+
+
+@pytest.mark.parametrize(
+    ("model", "body"),
+    [
+        ("board", {"observation": BOARD}),
+        ("board", {"observations": boards(8)}),
+        ("board.shared", {"observation": BOARD}),
+        ("duo.left", {"observation": BOARD}),
+        ("vector", VECTOR),
+        ("nested", NESTED),
+    ],
+)
+def test_plain_requests_take_the_fast_path(replica: Connections, model: str, body: Any) -> None:
+    count = len(replica.answered)
+    answer = exchange(replica.fast, request(body, model))
+    assert len(replica.answered) == count + 1
+    assert answer.startswith(b"HTTP/1.1 200 OK\r\n")
+    assert answer == exchange(replica.general, request(body, model))
+
+
+SENSES = {
+    "observation.mode": np.array([2, 1]),
+    "observation.sense.speed": np.array([[1.5, 2], [-1, 0.25]], np.float32),
+}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        infer(binary_boards(1), outputs=["action"]),
+        infer(binary_boards(8)),
+        infer(binary_boards(1), outputs=["action_dist_inputs", "action"]),
+        infer(binary_boards(1), "board/versions/1"),
+        infer(binary_boards(1), "board.shared/versions/champion"),
+        infer(dict(reversed(SENSES.items())), "nested"),
+        infer(binary_boards(1), more={"Accept-Encoding": "gzip"}),
+    ],
+)
+def test_binary_requests_take_the_fast_path(replica: Connections, data: bytes) -> None:
+    for _ in range(2):  # what the JSON says is known the second time
+        count = len(replica.answered)
+        answer = exchange(replica.fast, data)
+        assert len(replica.answered) == count + 1
+        assert answer.startswith(b"HTTP/1.1 200 OK\r\n")
+        assert answer == exchange(replica.general, data)
+
+
+OTHERS: dict[str, bytes] = {
+    "explore": request({"observation": BOARD, "explore": True, "seed": 3}),
+    "probabilities": request({"observation": BOARD, "probabilities": True}),
+    "a version": request({"observation": BOARD}, query="?version=2"),
+    "an encoded path": request({"observation": BOARD}, model="bo%61rd"),
+    "an unknown league": request({"observation": BOARD}, model="nobody"),
+    "an unknown policy": request({"observation": BOARD}, model="board.nobody"),
+    "no champion": request({"observation": BOARD}, model="empty"),
+    "no policy": request({"observation": BOARD}, model="duo"),
+    "no model": request({"observation": BOARD}, model=""),
+    "a slash": request({"observation": BOARD}, model="board/shared"),
+    "recurrent": request({"observation": [0.5]}, model="memory"),
+    "another media type": request({"observation": BOARD}, headers={"Content-Type": "application/xml"}),
+    "a charset": request({"observation": BOARD}, headers={"Content-Type": "application/json; charset=utf-8"}),
+    "an encoding": request({"observation": BOARD}, headers=JSON | {"Content-Encoding": "gzip"}),
+    "a timeout": request({"observation": BOARD}, headers=JSON | {"X-Request-Timeout-Ms": "1000"}),
+    "a wrong timeout": request({"observation": BOARD}, headers=JSON | {"X-Request-Timeout-Ms": "soon"}),
+    "a foreign page": request({"observation": BOARD}, headers=JSON | {"Origin": "http://example.org"}),
+    "a foreign host": request({"observation": BOARD}).replace(b"Host: localhost", b"Host: example.org"),
+    "a wrong key": request({"observation": BOARD}, headers=JSON | {"X-API-Key": "plk_wrong"}),
+    "too many": request({"observations": boards(9)}),
+    "large": request({"observation": BOARD, "seed": [1] * 20_000}),
+    "too large": request({"observation": BOARD, "seed": [1] * 40_000}),
+    "booleans": request({"observation": BOARD | {"action_mask": [True] * 7}}),
+    "an infinity": request({"observation": [1e39, 0]}, model="vector"),
+    "illegal": request({"observation": BOARD | {"action_mask": [0] * 7}}),
+    "binary, a response to compress": infer(
+        {"observation": np.zeros((8, 6, 7, 2), np.int8), "action_mask": np.ones((8, 7), np.int8)},
+        outputs=["action", "action_dist_inputs"],
+        more={"Accept-Encoding": "gzip"},
+    ).replace(b'"binary_data":true', b'"binary_data":null'),
+    "binary, illegal": infer({**binary_boards(1), "action_mask": np.zeros((1, 7), np.int8)}),
+    "binary, an infinity": infer({"observation": np.array([[np.inf, 0]], np.float32)}, "vector"),
+    "binary, out of range": infer(SENSES | {"observation.mode": np.array([9, 1])}, "nested"),
+    "binary, an input is missing": infer({"observation": binary_boards(1)["observation"]}),
+    "binary, unequal rows": infer(binary_boards(2) | {"action_mask": np.ones((1, 7), np.int8)}),
+    "binary, too many": infer(binary_boards(9)),
+    "binary, another datatype": infer({"observation": np.zeros((1, 2))}, "vector"),
+    "binary, an unknown output": infer(binary_boards(1), outputs=["value"]),
+    "binary, recurrent": infer({"observation": np.zeros((1, 1), np.float32)}, "memory"),
+    "binary, an unknown version": infer(binary_boards(1), "board/versions/9"),
+    "binary, no version": infer(binary_boards(1), "board/versions/"),
+    "binary, an encoding": infer(binary_boards(1), more={"Content-Encoding": "gzip"}),
+    "binary, a wrong length": infer(binary_boards(1), more={"Inference-Header-Content-Length": "soon"}),
+    "a duplicate key": request(b'{"observation": [1, 0], "observation": [0, 1]}', model="vector"),
+    **{f"body: {name}": request(body) for name, (body, *_) in BAD_BODIES.items()},
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_requests_get_the_same_answer(replica: Connections, name: str) -> None:
+    assert exchange(replica.fast, OTHERS[name]) == exchange(replica.general, OTHERS[name])
+
+
+def test_generated_requests_get_the_same_answers(replica: Connections) -> None:
+    count = len(replica.answered)
+    for seed in range(150):
+        assert differences(replica, random.Random(seed))[1] == []
+    assert len(replica.answered) > count + 100, "most of them are plain"
+
+
+@pytest.mark.slow
+def test_many_generated_requests_get_the_same_answers(replica: Connections) -> None:
+    for seed in range(1_000, 3_000):
+        assert differences(replica, random.Random(seed))[1] == []
+
+
+def test_requests_of_one_turn_are_one_batch(replica: Connections, monkeypatch: pytest.MonkeyPatch) -> None:
+    champion = replica.server.alias_slots.champion("board")
+    assert champion is not None
+    policy, sizes = champion.policy(None), list[int]()
+    run = type(policy).run_inline
+
+    def record(policy: Any, act: Any) -> Any:
+        actions = run(policy, act)
+        sizes.append(len(actions.actions))
+        return actions
+
+    monkeypatch.setattr(type(policy), "run_inline", record)
+    bodies = [{"observation": board} for board in boards(5)] + [{"observations": boards(3)}]
+    answers = together(replica, replica.fast, [request(body) for body in bodies])
+    assert sizes == [8]
+    monkeypatch.undo()
+    assert answers == [exchange(replica.general, request(body)) for body in bodies]
+
+
+def test_a_queue_is_answered_over_several_turns_the_oldest_first(
+    replica: Connections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queued, take_turn = [], PlainActions._take_turn
+
+    def record(plain: PlainActions, loop: asyncio.AbstractEventLoop) -> None:
+        take_turn(plain, loop)
+        queued.append(replica.server.access.backlog.queued)
+
+    monkeypatch.setattr(PlainActions, "_take_turn", record)
+    monkeypatch.setattr(plain_action, "SLICE", 0)
+    monkeypatch.setattr(plain_action, "GROUP", 3)
+    bodies = [{"observation": board} for board in boards(10)]
+    count = len(replica.answered)
+    answers = together(replica, replica.fast, [request(body) for body in bodies])
+    until(lambda: queued == [7, 4, 1, 0])
+    times = [request.time for request in replica.answered[count:]]
+    assert times == sorted(times)
+    assert answers == [exchange(replica.general, request(body)) for body in bodies]
+
+
+def test_a_refused_request_gets_the_same_answer_without_a_task(
+    replica: Connections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: Backlog) -> None:
+        raise Overloaded("too many requests are waiting in this replica")
+
+    monkeypatch.setattr(Backlog, "admit", refuse)
+    monkeypatch.setattr(HttpProtocol, "pass_on", lambda _: pytest.fail("the application is asked"))
+    data = request({"observation": BOARD})
+    with socket.create_connection(replica.fast) as connection:  # which remains open
+        for _ in range(2):
+            connection.sendall(data)
+            answer = receive(connection)
+            assert answer.startswith(b"HTTP/1.1 429")
+            assert b"retry-after: 1\r\n" in answer
+            assert answer == exchange(replica.general, data)
+
+
+def test_a_flawed_request_does_not_affect_others_of_its_turn(replica: Connections) -> None:
+    bodies: list[Any] = [{"observation": board} for board in boards(3)]
+    bodies.insert(1, {"observation": BOARD | {"action_mask": [0] * 7}})
+    bodies.insert(2, {"observation": BOARD | {"action_mask": [1, 1, 1, 1.5, 1, 1, 1]}})
+    answers = together(replica, replica.fast, [request(body) for body in bodies])
+    assert [answer[9:12] for answer in answers] == [b"200", b"400", b"400", b"200", b"200"]
+    assert answers == [exchange(replica.general, request(body)) for body in bodies]
+
+
+def test_a_slow_policy_occupies_the_event_loop_once(replica: Connections, monkeypatch: pytest.MonkeyPatch) -> None:
+    champion = replica.server.alias_slots.champion("board")
+    assert champion is not None
+    policy = champion.policy(None)
+    runs = 0
+
+    def take_long(policy: Any, act: Any) -> Any:
+        nonlocal runs
+        runs += 1
+        policy.inline_rows = 0
+        raise GraphTimeout("too slow")
+
+    monkeypatch.setattr(policy, "inline_rows", 8)
+    monkeypatch.setattr(type(policy), "run_inline", take_long)
+    bodies = [{"observations": boards(4)} for _ in range(5)]
+    answers = together(replica, replica.fast, [request(body) for body in bodies])
+    monkeypatch.undo()
+    assert runs == 1
+    assert answers == [exchange(replica.general, request(body)) for body in bodies]
+
+
+def test_a_fault_in_the_fast_path_leaves_no_request_without_an_answer(
+    replica: Connections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise RuntimeError("a bug")
+
+    bodies = [{"observation": board} for board in boards(3)]
+    expected = [exchange(replica.general, request(body)) for body in bodies]
+    monkeypatch.setattr(replica.server.plain_actions, "_answer", fail)
+    assert together(replica, replica.fast, [request(body) for body in bodies]) == expected
+    monkeypatch.undo()
+    monkeypatch.setattr(replica.server.access, "admission", fail)
+    assert exchange(replica.fast, request(bodies[0])).startswith(b"HTTP/1.1 500")
+    monkeypatch.undo()
+    assert together(replica, replica.fast, [request(body) for body in bodies]) == expected
+
+
+def test_pipelined_requests_are_answered_in_order(replica: Connections) -> None:
+    requests = [request({"observation": BOARD}), OTHERS["probabilities"], request(VECTOR, "vector"), OTHERS["illegal"]]
+    for parts in (requests, requests[::-1]):
+        with socket.create_connection(replica.fast) as connection:
+            connection.sendall(b"".join(parts))
+            answers = receive(connection, len(parts))
+        assert answers == b"".join(exchange(replica.general, part) for part in parts)
+
+
+def test_a_body_in_pieces(replica: Connections) -> None:
+    data = request({"observations": boards(8)})
+    expected = exchange(replica.general, data)
+    for piece in (50, 200, 1000, len(data) - 1):
+        with socket.create_connection(replica.fast) as connection:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.sendall(data[:piece])
+            exchange(replica.fast, request(VECTOR, "vector"))  # the server has read the first piece
+            connection.sendall(data[piece:])
+            assert receive(connection) == expected
+
+
+def test_an_idle_connection_keeps_no_body(replica: Connections) -> None:
+    for data in (request({"observations": boards(8)}), OTHERS["probabilities"]):
+        with socket.create_connection(replica.fast) as connection:
+            connection.sendall(data)
+            receive(connection)
+            port = connection.getsockname()
+            protocols = [item for item in gc.get_objects() if isinstance(item, HttpProtocol)]
+            # Closed connections, which the recorded requests refer to, may have had the same port.
+            (protocol,) = (item for item in protocols if item.client == port and item in item.connections)
+            assert protocol.body == b""
+
+
+def test_a_client_that_is_gone(replica: Connections) -> None:
+    with replica.busy():
+        with socket.create_connection(replica.fast) as connection:
+            connection.sendall(request({"observation": BOARD}))
+        expected = request({"observation": BOARD})
+    assert exchange(replica.fast, expected) == exchange(replica.general, expected)
+
+
+def test_keys_and_their_limits_hold(tmp_path: Path) -> None:
+    with changing(Storage.at(tmp_path / "home")) as (replica, registry):
+        _, token = registry.keys.create("game", ["act"], only_leagues=["board"], rate=2)
+        board, keyed = {"observation": BOARD}, JSON | {"X-API-Key": token}
+        until(lambda: exchange(replica.fast, request(board)).startswith(b"HTTP/1.1 401"))
+        assert exchange(replica.fast, request(board)) == exchange(replica.general, request(board))
+        foreign = request(VECTOR, "vector", keyed)
+        assert exchange(replica.fast, foreign).startswith(b"HTTP/1.1 403")
+        count = len(replica.answered)
+        answers = together(replica, replica.fast, [request(board, headers=keyed) for _ in range(6)])
+        statuses = [answer[9:12] for answer in answers]
+        assert set(statuses) == {b"200", b"429"}
+        assert len(replica.answered) == count + statuses.count(b"200")
+        assert b"x-league-key-accepted: 1" in next(answer for answer in answers if answer[9:12] == b"200")
+
+
+def test_shadow_and_metrics_count(tmp_path: Path) -> None:
+    with changing(Storage.at(tmp_path / "home")) as (replica, registry):
+        set_shadow(registry)
+        until(lambda: "board" in replica.server.traffic.shadows)
+        until(lambda: replica.server.alias_slots.get("board", "2") is not None)
+        for board in boards(4):
+            exchange(replica.fast, request({"observation": board}))
+        assert len(replica.answered) == 4
+        counts = wait_for(registry, lambda counts: counts.requests + counts.dropped == 4)
+        assert counts.dropped == 0
+        assert replica.server.metrics.totals()["action"][0] == 4
+
+
+def test_a_canary_is_asked_by_the_application(tmp_path: Path) -> None:
+    with changing(Storage.at(tmp_path / "home")) as (replica, registry):
+        registry.traffic.set("board", canary=Portion(2, 0.5), actor="test", reason="test")
+        until(lambda: "board" in replica.server.traffic.canaries)
+        for name in "abcdefgh":
+            data = request({"observation": BOARD}, headers=JSON | {"X-League-Key": name})
+            assert exchange(replica.fast, data) == exchange(replica.general, data)
+        assert replica.answered == []
+        exchange(replica.fast, request(VECTOR, "vector"))
+        assert len(replica.answered) == 1, "other leagues have none"
+
+
+def test_members_of_a_mixture_answer_their_callers(tmp_path: Path) -> None:
+    with changing(Storage.at(tmp_path / "home")) as (replica, registry):
+        promote(registry, "board", registry.publisher.publish_mixture("board", {1: 0.5, 2: 0.5}).number)
+        until(lambda: (served := replica.server.alias_slots.champion("board")) is not None and served.members)
+        answers = set()
+        for name in "abcdefgh":
+            data = request({"observation": BOARD}, headers=JSON | {"X-League-Key": name})
+            answers.add(exchange(replica.fast, data))
+            assert exchange(replica.general, data) in answers
+        assert len(answers) == 2
+        assert len(replica.answered) == 8
+
+
+def test_a_full_replica_refuses(tmp_path: Path) -> None:
+    with changing(Storage.at(tmp_path / "home"), QUICK.model_copy(update={"max_in_flight": 1})) as (replica, _):
+        replica.server.action.in_flight = 1
+        data = request({"observation": BOARD})
+        assert exchange(replica.fast, data).startswith(b"HTTP/1.1 429")
+        assert exchange(replica.fast, data) == exchange(replica.general, data)
+
+
+def test_the_application_answers_pages_of_other_origins(storage: Storage) -> None:
+    headers = [(b"content-length", b"2"), (b"content-type", b"application/json")]
+    for origins, takes in (([], True), (["https://game.example"], False)):
+        settings = QUICK.model_copy(update={"cors_origins": origins})
+        plain = Replica(Registry.open(storage), settings, "replica-1").plain_actions
+        assert plain is not None
+        assert plain.takes(b"/v1/policies/board/action", headers)
+        assert plain.takes(b"/v1/policies/board/action", [*headers, (b"origin", b"https://game.example")]) is takes

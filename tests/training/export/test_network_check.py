@@ -1,0 +1,87 @@
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from league.environments.building import interface
+from league.errors import ConfigError
+from tests.support.leagues.training_leagues import maddpg, tictactoe
+from tests.support.policies import networks
+from training.export.network_check import check_network
+from training.runs.train import check
+
+PLAIN: dict[str, Any] = {"hidden": [256, 256]}
+"""The default, in place of the league's."""
+
+
+def marked(mark: str) -> str:
+    """File and line of a comment among the networks."""
+    lines = Path(networks.__file__).read_text().splitlines()
+    (number,) = (number for number, line in enumerate(lines, 1) if line.endswith(f"  # {mark}"))
+    return f"{networks.__file__}, line {number}"
+
+
+@pytest.mark.parametrize("training", [{}, {"normalize_observations": True}, {"algorithm": "dqn"}, {"recurrence": {}}])
+def test_a_network_is_accepted(training: dict[str, Any]) -> None:
+    league = tictactoe(network=networks.settings("Good"), **PLAIN, **training)
+    check(league, interface(league))
+
+
+def test_without_a_network_nothing_is_played() -> None:
+    league = tictactoe()
+    check_network(league.model_copy(update={"environment": None}), interface(league))
+
+
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("Branching", "cannot be exported to ONNX: GuardOnDataDependentSymNode: Could not guard"),
+        ("Decomposing", "cannot be exported to ONNX: DispatchError: No ONNX function found for"),
+        ("Random", "differs from its ONNX graph by up to"),
+        ("Raising", "raises IndexError: index 99 is out of bounds"),
+        ("InPlace", "raises RuntimeError: one of the variables needed for gradient computation"),
+        ("Paired", "returned a tuple: expected float32 [64, 8], a row of its `width` for each observation"),
+        ("Infinite", "returned numbers that are not finite"),
+    ],
+)
+def test_a_faulty_network_is_refused_with_its_line(name: str, problem: str, capfd: pytest.CaptureFixture[str]) -> None:
+    league = tictactoe(network=networks.settings(name), **PLAIN)
+    with pytest.raises(ConfigError) as refused:
+        check(league, interface(league))
+    message = f"training.network: {networks.__name__}:{name} ({marked(name)}) {problem}"
+    assert str(refused.value).startswith(message)
+    assert "File" not in "".join(capfd.readouterr()), "what torch prints about it"
+
+
+def test_another_width_than_declared_is_refused() -> None:
+    league = tictactoe(network=networks.settings("Good", width=9), **PLAIN)
+    problem = f"Good ({marked('width')}) returned float32 [64, 8]: expected float32 [64, 9]"
+    with pytest.raises(ConfigError, match=re.escape(problem)):
+        check(league, interface(league))
+
+
+@pytest.mark.parametrize(
+    ("network", "problem"),
+    [
+        (networks.settings("Good", width=None), "has the width None, expected the number of its features as an int"),
+        (networks.settings("Good", depth=1), "cannot be created: TypeError: .* unexpected keyword argument 'depth'"),
+        (networks.settings("Unbuilt"), rf"cannot be created \({re.escape(marked('Unbuilt'))}\): KeyError: 'planes'"),
+        (networks.settings("no_module"), "returned a int, expected an nn.Module"),
+        (networks.settings("Goood"), "has no 'Goood', did you mean 'Good'?"),
+        ({"entry_point": "no_such_module:Net"}, "cannot import 'no_such_module'"),
+    ],
+)
+def test_what_is_no_network_is_refused(network: dict[str, Any], problem: str) -> None:
+    league = tictactoe(network=network, **PLAIN)
+    with pytest.raises(ConfigError, match=rf"^training\.network: .*{problem}"):
+        check(league, interface(league))
+
+
+def test_a_network_takes_the_place_of_layers() -> None:
+    with pytest.raises(ConfigError, match="network takes the place of hidden: remove one of them"):
+        tictactoe(network=networks.settings("Good"))
+    with pytest.raises(ConfigError, match=r"entry_point: expected package\.module:name"):
+        tictactoe(network={"entry_point": "networks"}, **PLAIN)
+    # Those of MADDPG are the critics', too.
+    maddpg("remembering", {}, {"shared": ["*"]}, network=networks.settings("Good"))
