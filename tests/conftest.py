@@ -12,7 +12,7 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from league.registry.storage import database
 from league.registry.storage.database import Database
@@ -22,9 +22,21 @@ from tests.support.durability import without_syncing
 from tests.support.schema import migrated_once
 from tests.support.servers import postgresql
 
-# Tests do not measure time: other load on the machine must not make one fail.
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
+# Tests do not measure time: other load on the machine must not make one fail. All draw the same examples, so that a
+# change fails where it is made; others are drawn every night.
+settings.register_profile(
+    "same",
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[
+        HealthCheck.too_slow,
+        HealthCheck.data_too_large,
+        HealthCheck.large_base_example,
+        HealthCheck.function_scoped_fixture,
+    ],
+)
+settings.register_profile("random", settings.get_profile("same"), derandomize=False, print_blob=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 # By default Ray's workers have niceness 15: next to four busy processes they get a fiftieth of a core, and a training
 # run that takes half a minute was not ready after ten.
 os.environ.setdefault("RAY_worker_niceness", "0")

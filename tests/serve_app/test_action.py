@@ -12,7 +12,7 @@ from urllib.parse import quote
 import httpx
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
@@ -346,7 +346,7 @@ near_misses = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, deadline=None)
 @given(
     body=st.binary(max_size=60) | near_misses.map(lambda body: json.dumps(body).encode()),
     model=st.sampled_from(["board", "vector", "nested", "memory", "duo", "duo.left"]) | st.text(max_size=10),

@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from schemathesis.schemas import APIOperation
 
@@ -122,7 +122,7 @@ def test_replicas_are_compared_when_they_have_reported(replicas: ReplicasOfBoth)
 
 
 @pytest.mark.parametrize("operation", OPERATIONS, ids=lambda each: each.label.replace("/", " "))
-@settings(max_examples=3, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=3, deadline=None)
 @given(data=st.data())
 def test_generated_requests(replicas: ReplicasOfBoth, operation: APIOperation, data: st.DataObject) -> None:
     drawn = draw_request(data, operation)

@@ -5,7 +5,7 @@ from itertools import count
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from league.errors import (
@@ -167,7 +167,7 @@ def test_rolling_back_requires_a_previous_version(registry: Registry) -> None:
 leagues = (f"league-{i}" for i in count())
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None)
 @given(st.lists(st.sampled_from([1, 2, 3, "rollback"]), max_size=12))
 def test_rollbacks_follow_the_stack_of_promotions(local: Registry, moves: list[int | str]) -> None:
     league = next(leagues)

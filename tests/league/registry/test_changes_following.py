@@ -6,7 +6,7 @@ from datetime import timedelta
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import update
 
@@ -204,7 +204,7 @@ def test_an_event_with_the_id_of_a_removed_one_is_awaited(local: Registry) -> No
         max_size=12,
     )
 )
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(max_examples=30)
 def test_counts_in_sql_agree_with_the_listed_acknowledgements(local: Registry, steps: list[tuple[str, int]]) -> None:
     if not local.versions.all(LEAGUE):
         registered(local, LEAGUE, versions=3)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from league.config.league import LeagueConfig
@@ -40,7 +40,7 @@ def sampled(league: LeagueConfig, steps: int) -> list[EpisodeChunks]:
     crashing=st.sampled_from([0.0, 0.3]),
     fragment_lengths=FRAGMENT_LENGTHS,
 )
-@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=20)
 def test_others_are_of_the_same_episode_and_absent_ones_are_zeros(
     agents: int, num_envs: int, crashing: float, fragment_lengths: list[int]
 ) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo import ParallelEnv
 
@@ -60,7 +60,7 @@ def expected_rows(seed: int, agent: int, record: AgentRecord) -> list[tuple[obje
     opponents=st.sampled_from([[], [RANDOM]]),
     fragment_lengths=FRAGMENT_LENGTHS,
 )
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=100)
 def test_each_transition_is_recorded_once_with_its_successor(
     agents: int,
     num_envs: int,
