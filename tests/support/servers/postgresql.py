@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import DEVNULL
-from typing import Any
 
 import psycopg
 
@@ -28,19 +27,21 @@ def programs() -> Path | None:
 @contextmanager
 def server(binaries: Path, max_connections: int = 100) -> Iterator[Path]:
     """Run a server; yields the directory of its socket. PostgreSQL does not run as root: root switches to another
-    account.
+    account, and not in a fork of this process (`user=` of subprocess): it has threads, and one such fork was aborted.
     """
-    account = _account()
+    account, switch = _account(), []
     with tempfile.TemporaryDirectory(prefix="pg") as name:
         home = Path(name)
         if account:
             shutil.chown(home, account)
-        quiet: dict[str, Any] = {"user": account, "cwd": home, "stdin": DEVNULL, "stdout": DEVNULL, "stderr": DEVNULL}
+            switch = ["setpriv", f"--reuid={account}", f"--regid={pwd.getpwnam(account).pw_gid}", "--init-groups"]
         data = str(home / "data")
         initdb = [str(binaries / "initdb"), "-D", data, "-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync"]
-        subprocess.run(initdb, check=True, **quiet)
+        done = subprocess.run([*switch, *initdb], cwd=home, stdin=DEVNULL, capture_output=True, text=True)
+        assert done.returncode == 0, f"{done.returncode}: {done.stdout}{done.stderr}"
         options = ["-k", name, "-c", "listen_addresses=", "-c", "fsync=off", "-c", f"max_connections={max_connections}"]
-        process = subprocess.Popen([str(binaries / "postgres"), "-D", data, *options], **quiet)
+        command = [*switch, str(binaries / "postgres"), "-D", data, *options]
+        process = subprocess.Popen(command, cwd=home, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL)
         try:
             _wait(home, process)
             yield home
