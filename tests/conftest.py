@@ -179,13 +179,11 @@ def parsed_operators() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def ray_session() -> Iterator[None]:
     """One Ray with two CPUs for all tests of this process that need it."""
-    import ray
+    from league import ray_cluster
 
-    from league.ray_cluster import LocalRay, start_local
-
-    start_local(LocalRay(cpus=2, runtime_envs=True))
-    yield
-    ray.shutdown()
+    with ray_cluster.ray_session():
+        ray_cluster.start_local(ray_cluster.LocalRay(cpus=2, runtime_envs=True))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ import httpx
 import pytest
 import yaml
 
+from league.local_ray import token
 from league.registry.registry import Registry
 from league.settings import Storage
 from policy_league.cli.training.train import next_step
@@ -149,8 +150,10 @@ def test_a_sweep_prints_its_trials_and_the_best_settings(league: League, config:
     ],
 )
 def test_invalid_options_are_rejected_in_one_line(
-    league: League, config: Path, arguments: tuple[str, ...], message: str
+    league: League, config: Path, arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for name in (token.MODE, token.TOKEN, token.TOKEN_FILE):  # of a Ray that other tests of this process share
+        monkeypatch.delenv(name, raising=False)
     result = league("train", str(config), *arguments)
     assert result.code == 2, result.err
     assert result.err.startswith("league: ")
