@@ -3,7 +3,6 @@
 import gc
 import os
 import re
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -41,82 +40,22 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 # run that takes half a minute was not ready after ten.
 os.environ.setdefault("RAY_worker_niceness", "0")
 
-ROOT = Path(__file__).parents[1]
-SHARED = ("ray_session", "ray_server")
-"""Session fixtures that take long to set up."""
-SECONDS = {
-    "tests/cluster/test_autoscaler.py": 60,
-    "tests/serve_app/test_autoscaling.py": 39,
-    "tests/evaluation/gating/test_training_night.py": 60,
-    "tests/evaluation/gating/test_nightly.py": 30,
-    "tests/training/runs/test_train.py": 26,
-    "tests/test_tutorial.py": 25,
-    "tests/benchmarks/": 20,
-    "tests/serve_app/test_attacks.py": 30,
-    "tests/test_wheel.py": 15,
-    "tests/league/local_ray/": 10,
-    "tests/training/test_learning.py": 10,
-    "tests/training/algorithms/": 8,
-    "tests/serve_app/test_faults.py": 7,
-    "tests/test_restore_parity.py": 6,
-    "tests/browser/": 3,
-    "tests/test_environments.py": 3,
-}
-"""Processor time of a slow test of these files and folders, about; of any other test, a second. Wrong values cost time
-only: long files that start last leave a process without work."""
-
-
+pytest_plugins = ("tests.support.distribution",)
 ONLY_SLOW = re.compile(r"^pytestmark = .*pytest\.mark\.slow\b", re.MULTILINE)
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Distribute files among the processes. Files that share a server, and files of a folder that share a Ray session,
-    go to the same process. A process starts one Ray, whichever of them it runs; all files of `tests/training` together
-    would be the longest part of the slow tests."""
-    from xdist.scheduler import LoadScopeScheduling
-
-    if gone := [path for path in SECONDS if not (ROOT / path).exists()]:
-        raise pytest.UsageError(f"tests/conftest.py: SECONDS names {gone[0]}, which does not exist")
-
-    class BySharedResource(LoadScopeScheduling):
-        def _split_scope(self, nodeid: str) -> str:
-            return _shared_resource(nodeid.partition("::")[0])
-
-    config.option.loadscopereorder = False  # by the number of tests
-    return BySharedResource(config, log)
+WORDS = {"slow": r"slow|on_both_databases", "e2e": "e2e"}
+"""What a file with such tests contains."""
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Of the files without slow tests, `make test-slow` imports none, and `make test` none with slow tests only. Every
-    process imports all others: half of the time of a collection.
+    """Import no file without slow tests in `make test-slow`, none with slow tests only in `make test`, and none without
+    a test of `make test-e2e` there. Every process imports all others: half of the time of a collection.
     """
     if not collection_path.match("test_*.py"):
         return None
     text = collection_path.read_text()
-    if config.option.markexpr == "slow":
-        return not re.search(r"slow|on_both_databases", text) or None
-    return (config.option.markexpr == "not slow" and bool(ONLY_SLOW.search(text))) or None
-
-
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Let each of several processes start with the files that take longest."""
-    if hasattr(config, "workerinput"):
-        seconds = Counter[str]()
-        files = {item: item.nodeid.partition("::")[0] for item in items}
-        for file in files.values():
-            seconds[_shared_resource(file)] += next((SECONDS[path] for path in SECONDS if file.startswith(path)), 1)
-        items.sort(key=lambda item: -seconds[_shared_resource(files[item])])
-
-
-@cache
-def _shared_resource(file: str) -> str:
-    text = (ROOT / file).read_text()
-    shared = next((fixture for fixture in SHARED if fixture in text), file)
-    if shared == "ray_session":
-        return f"{shared} of {Path(file).parent}"
-    return "browser" if file.startswith("tests/browser/") else shared
+    if config.option.markexpr == "not slow and not e2e":
+        return bool(ONLY_SLOW.search(text)) or None
+    return not re.search(WORDS.get(config.option.markexpr, ""), text) or None
 
 
 def pytest_collection_finish() -> None:
