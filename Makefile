@@ -3,9 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-PROCESSES ?= 3
+PROCESSES ?= 2
 
-.PHONY: setup demo test test-slow test-clients coverage check fix bench dist docs generate protocol clean
+.PHONY: setup demo test test-e2e test-slow coverage check fix bench dist docs generate protocol clean
 .DEFAULT_GOAL := setup
 
 # LOCKED=1 installs the files of requirements/ and no others: Linux on x86-64 only.
@@ -32,30 +32,37 @@ demo: setup
 	$(BIN)/league demo $(DEMO)
 
 # Tests start many processes, which share compiled modules.
-test test-slow: export PYTHONDONTWRITEBYTECODE =
+test test-e2e test-slow: export PYTHONDONTWRITEBYTECODE =
+
+# $(call run,NAME,SECONDS,OPTIONS): a test that fails passes if it then passes alone, except where TESTS or PYTEST is set.
+run = $(BIN)/python $(if $(TESTS)$(PYTEST),-m pytest,scripts/run_tests.py $(1) $(2)) $(3) --dist loadscope $(PYTEST) $(TESTS)
 
 # Every few minutes of work: all that is not slow by nature, in $(PROCESSES) processes. TESTS=tests/league runs a part.
 test: setup
-	$(BIN)/python -m pytest -m "not slow" -n $(PROCESSES) --dist loadscope $(PYTEST) $(TESTS)
+	$(call run,quick,3000,-m "not slow and not e2e" -n $(PROCESSES))
+
+# One test for each promise that no quick test keeps, one after another.
+test-e2e: setup
+	$(call run,e2e,1500,-m e2e -n 1)
 
 # Branch coverage of product code by the quick tests, which take almost twice as long with it.
 coverage: setup
 	$(MAKE) test PYTEST="--cov --cov-report= $(PYTEST)"
 	$(BIN)/coverage report --skip-covered --sort=cover
 
-# Learning to a level, every environment, kills and clusters. A cluster that serves under load needs all cores: its tests
-# run alone.
-test-slow: setup
-ifdef TESTS
-	$(BIN)/python -m pytest -m slow -n $(PROCESSES) --dist loadscope $(PYTEST) $(TESTS)
-else
-	$(BIN)/python -m pytest -m slow -n $(PROCESSES) --dist loadscope $(PYTEST) --ignore tests/cluster/test_cluster.py --ignore tests/clients
-	$(BIN)/python -m pytest -m slow $(PYTEST) tests/cluster/test_cluster.py
-endif
+# Learning to a level, every environment, kills and clusters: PART=serving or TESTS=tests/cli runs some of them. A cluster
+# that serves under load needs all cores; clients in other languages need Node.js 20 and npm's registry.
+pages := tests/browser tests/test_docs.py
+serving := tests/serve_app tests/cli tests/policy_league_client tests/test_tutorial.py tests/test_wheel.py
+training := tests/training tests/examples tests/test_environments.py tests/test_restore_parity.py
+evaluation := tests/evaluation tests/league tests/benchmarks
+clusters := tests/cluster tests/clients
+PARTS := pages serving training evaluation clusters
 
-# Clients in other languages, with their own package managers: `npm ci` needs npm's registry.
-test-clients: setup
-	$(BIN)/python -m pytest -m slow $(PYTEST) tests/clients
+test-slow: $(addprefix slow-,$(if $(TESTS),tests,$(or $(PART),$(PARTS))))
+
+slow-%: setup
+	$(BIN)/python -m pytest -m slow -n $(if $(filter clusters,$*),0,$(PROCESSES)) --dist loadscope $(PYTEST) $(or $(TESTS),$($*))
 
 check: setup
 	$(BIN)/ruff format --check .

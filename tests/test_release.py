@@ -56,6 +56,18 @@ def test_a_release_is_built_as_in_ci_and_attested() -> None:
     commands = [step.get("run", "") for step in steps("release.yml")]
     targets = re.findall(r"^make ([\w-]+)", "\n".join(commands), flags=re.M)
     assert targets == ["setup", "dist", "test-slow"]
-    assert re.search(r"^make .*\bdist$", (ROOT / ".ci/run").read_text(), flags=re.M)
+    assert re.search(r"^make dist$", (ROOT / ".ci/run").read_text(), flags=re.M)
     attested = [step["with"]["subject-path"] for step in steps("release.yml") if "attest" in step.get("uses", "")]
     assert attested == ["dist/*"]
+
+
+def test_every_slow_test_is_in_a_part_that_runs_every_night() -> None:
+    parts = dict(re.findall(r"^(\w+) := (tests/.+)$", (ROOT / "Makefile").read_text(), flags=re.M))
+    (job,) = yaml.safe_load((GITHUB / "workflows/scheduled.yml").read_text())["jobs"].values()
+    commands = "\n".join(job["strategy"]["matrix"]["command"])
+    assert re.findall(r"PART=(\w+)", commands) == list(parts)
+    folders = [ROOT / path for paths in parts.values() for path in paths.split()]
+    slow = [
+        path for path in (ROOT / "tests").rglob("test_*.py") if re.search(r"mark\.slow|on_both_\w+", path.read_text())
+    ]
+    assert [path for path in slow if sum(path.is_relative_to(folder) for folder in folders) != 1] == []

@@ -83,6 +83,7 @@ def run(league: Path, directory: Path) -> Installed:
     return command
 
 
+@pytest.mark.e2e
 def test_the_wheel_contains_all_tracked_files_of_the_packages(wheel: Path) -> None:
     files = {name.removeprefix(CLIENT) for name in tracked(*PACKAGES[:3], *PACKAGES[4:], f"{CLIENT}{PACKAGES[3]}")}
     with zipfile.ZipFile(wheel) as archive:
@@ -92,6 +93,7 @@ def test_the_wheel_contains_all_tracked_files_of_the_packages(wheel: Path) -> No
         assert tuple(archive.read(top_level).decode().split()) == PACKAGES
 
 
+@pytest.mark.e2e
 def test_modules_come_from_the_wheel(league: Path, directory: Path) -> None:
     program = f"import importlib; print(*(importlib.import_module(name).__file__ for name in {PACKAGES}))"
     python = [str(league.with_name("python")), "-c", program]
@@ -104,6 +106,7 @@ def test_doctor(run: Installed) -> None:
     assert process.returncode == 0, process.stdout + process.stderr
 
 
+@pytest.mark.e2e
 def test_demo(run: Installed) -> None:
     """It trains a bundled configuration, evaluates and serves."""
     process = run("demo", "--minutes", "0.2", "--exit", "--port", str(free_ports(1)[0]))

@@ -33,6 +33,7 @@ def expect_champion(page: Page, version: int) -> None:
     expect(row).to_contain_text(f"{LEAGUE}@{version}")
 
 
+@pytest.mark.e2e
 def test_a_promotion_and_a_rollback_change_the_leaderboard_without_reload(tab: Tab, served: Served) -> None:
     page = tab.open(L)
     page.evaluate("window.isSameDocument = true")

@@ -51,6 +51,7 @@ PAGES = {
     f"/leagues/{CONNECT_FOUR}/play#opponent=script:random&agent=player_0&seed=1&actions=": (r"Your turn", r"seed 1"),
     f"{L}/nothing": (r"Page not found",),
 }
+E2E = ("/", L, f"{L}/payoff", f"{L}/verdicts/{{verdict}}")
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +61,7 @@ def names(served: Served) -> dict[str, str]:
     return {"verdict": verdict.id, "schedule": verdict.schedule}
 
 
-@pytest.mark.parametrize("path", PAGES)
+@pytest.mark.parametrize("path", [pytest.param(path, marks=pytest.mark.e2e) if path in E2E else path for path in PAGES])
 def test_a_page(tab: Tab, names: dict[str, str], path: str) -> None:
     page = tab.open(path.format(**names))
     for words in PAGES[path]:

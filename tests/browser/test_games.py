@@ -67,6 +67,7 @@ def test_a_game_is_played_back_step_by_step(tab: Tab, served: Served) -> None:
     expect(info).to_contain_text("Start")
 
 
+@pytest.mark.e2e
 def test_a_search_version_analyses_a_recorded_game(tab: Tab, served: Served) -> None:
     match = Ledger(served.registry).matches(league=SEARCHED)[0]
     page = tab.open(f"/leagues/{SEARCHED}/matches/{match.schedule}/{match.position}/0")
@@ -173,7 +174,11 @@ def start(page: Page, opponent: str, seat: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("opponent", "score", "text"), [("script:random", 1, "You won"), ("script:one_ply", 0, "You lost")]
+    ("opponent", "score", "text"),
+    [
+        pytest.param("script:random", 1, "You won", marks=pytest.mark.e2e),
+        ("script:one_ply", 0, "You lost"),
+    ],
 )
 def test_a_game_of_connect_four_is_played_by_clicks(
     tab: Tab, served: Served, opponent: str, score: float, text: str

@@ -70,6 +70,7 @@ def select(page: Page, tab: str) -> Page:
     return page
 
 
+@pytest.mark.e2e
 def test_all_results_are_on_its_pages(opened: Open, report: dict[str, Any]) -> None:
     page = opened(report)
     expect(page.get_by_role("heading", level=1)).to_have_text(LEAGUE)

@@ -23,6 +23,7 @@ WAIT = 60.0
 """Seconds for replicas to follow, on shared cores."""
 
 
+@pytest.mark.e2e
 def test_a_learner_runs_where_there_are_cpus(cluster: LeagueCluster, directory: Path) -> None:
     """The driver is on the head, which has none: the learner and its checkpoints are on a worker."""
     output = scenarios.train(cluster, directory)

@@ -193,6 +193,8 @@ def test_a_remote_policy_acts_as_the_graph(url: str, served: Registry) -> None:
         np.testing.assert_array_equal(policy.act(batch).actions, expected)
 
 
+@pytest.mark.slow
+@pytest.mark.e2e
 def test_promotions_under_load_lose_no_request(url: str, served: Registry) -> None:
     def caller() -> Callable[[], int]:
         client = httpx.Client(base_url=url)
@@ -241,6 +243,7 @@ def memory(storage: Storage) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 def test_our_client_survives_the_death_of_a_replica(url: str, served: Registry) -> None:
     victim = processes(served.storage, "PolicyServer")[0]
 

@@ -29,7 +29,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-@pytest.fixture(params=CASES)
+@pytest.fixture(params=[pytest.param("ppo", marks=[pytest.mark.slow, pytest.mark.e2e]), *list(CASES)[1:]])
 def case(request: pytest.FixtureRequest) -> tuple[LeagueConfig, Any]:
     entry_point, training = CASES[request.param]
     document = {"league": "stock", "environment": {"entry_point": entry_point}, "training": training}

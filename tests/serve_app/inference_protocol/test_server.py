@@ -93,6 +93,7 @@ def test_a_promotion_applies_to_both_protocols(address: Address, served: Registr
 
 
 @pytest.mark.slow
+@pytest.mark.e2e
 def test_retried_calls_survive_the_death_of_a_replica(address: Address, served: Registry) -> None:
     arrays = {"observation": np.zeros((1, 2), np.float32)}
     with Triton("grpc", address) as triton:

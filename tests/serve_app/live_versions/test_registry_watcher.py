@@ -313,6 +313,8 @@ def processes(registry: Registry, name: str) -> list[int]:
         return list(session.scalars(text("SELECT pid FROM pg_stat_activity WHERE application_name = :n"), {"n": name}))
 
 
+@pytest.mark.slow
+@pytest.mark.e2e
 def test_postgresql_notifies_replicas(registry: Registry) -> None:
     if not is_server(registry):
         pytest.skip("SQLite is polled")

@@ -76,6 +76,8 @@ def trained(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -> Iter
     registry.close()
 
 
+@pytest.mark.slow
+@pytest.mark.e2e
 def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> None:
     registry = trained.registry
     assert lineage(trained.versions) == [(1, 512, None), (2, 1024, 1)]
