@@ -1,7 +1,7 @@
 """Settings of canary and shadow, shadow statistics, and waiting for replicas."""
 
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import timedelta
 
 import pytest
 from sqlalchemy import update
@@ -10,6 +10,7 @@ from league.errors import Conflict, InvalidInput, KeyReused, NotReady, UnknownAl
 from league.histograms import BOUNDS
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
+from league.registry.storage.database import clock
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic
 from league.registry.storage.tables import ReplicaReportTable
@@ -116,11 +117,8 @@ def test_reports_are_the_latest_of_live_replicas(versioned: Registry) -> None:
     versioned.replicas.write_report("replica-3", {"c": 1})
     versioned.replicas.remove("replica-2")
     with versioned.database.write() as session:
-        session.execute(
-            update(ReplicaReportTable)
-            .filter_by(replica="replica-3")
-            .values(at=datetime.now(UTC) - timedelta(minutes=1))
-        )
+        earlier = clock(session) - timedelta(minutes=1)
+        session.execute(update(ReplicaReportTable).filter_by(replica="replica-3").values(at=earlier))
     assert versioned.replicas.reports() == {"replica-1": {"a": 2}}
 
 
