@@ -24,6 +24,7 @@ WAIT = 60.0
 
 
 @pytest.mark.e2e
+@pytest.mark.timeout(1200)  # less than that of `make test-e2e`
 def test_a_learner_runs_where_there_are_cpus(cluster: LeagueCluster, directory: Path) -> None:
     """The driver is on the head, which has none: the learner and its checkpoints are on a worker."""
     output = scenarios.train(cluster, directory)
