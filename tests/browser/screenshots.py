@@ -25,7 +25,7 @@ from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from serve_app.runtime.launch import running
-from tests.support.clients.browsers import ARGUMENTS
+from tests.support.clients.browsers import ARGUMENTS, expect_finished
 from tests.support.leagues import tictactoe
 from tests.support.leagues.browser_leagues import (
     CONFIGS,
@@ -99,9 +99,8 @@ def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], di
     """Take one screenshot, with a reduced palette."""
     page = browser.new_page(viewport=SIZE, color_scheme="dark" if picture.is_dark else "light", reduced_motion="reduce")
     page.goto(url + picture.path.format(**names))
-    expect(page.locator("main")).to_contain_text(re.compile(picture.text), timeout=90_000)
-    for unfinished in (".loading", ".plot:not(:has(canvas))", ".screen:not(:has(img))"):
-        expect(page.locator(unfinished)).to_have_count(0, timeout=30_000)
+    expect(page.locator("main")).to_contain_text(re.compile(picture.text))
+    expect_finished(page)
     path = directory / f"{picture.name}.png"
     page.screenshot(path=path)
     page.close()
@@ -118,6 +117,7 @@ def main(directory: Path) -> None:
         names = {"verdict": verdict_between_versions(registry).id, "run": registry.runs.newest(TRAINED)[0].id}
         with sync_playwright() as playwright:
             path = which("chromium") or playwright.chromium.executable_path
+            expect.set_options(timeout=90_000)
             browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
             for picture in PICTURES:
                 take(browser, url, picture, names, directory)

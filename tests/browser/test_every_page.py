@@ -5,7 +5,7 @@ import re
 import pytest
 from playwright.sync_api import expect
 
-from tests.support.clients.browsers import Served, Tab, serious
+from tests.support.clients.browsers import Served, Tab, expect_finished, expect_fits, resize, serious
 from tests.support.leagues.browser_leagues import CONNECT_FOUR, EMPTY, NAMED, RUN, verdict_between_versions
 from tests.support.leagues.tictactoe import LEAGUE
 
@@ -66,13 +66,11 @@ def test_a_page(tab: Tab, names: dict[str, str], path: str) -> None:
     page = tab.open(path.format(**names))
     for words in PAGES[path]:
         expect(page.locator("body")).to_contain_text(re.compile(words))
-    expect(page.locator("h1")).to_have_count(1)
-    assert page.title().endswith("Policy League")
+    expect_finished(page)
+    expect(page).to_have_title(re.compile(". · Policy League$"))
     assert serious(page) == []
-    page.set_viewport_size({"width": 360, "height": 740})
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (
-        "the page scrolls horizontally on a phone"
-    )
+    resize(page, 360)  # a phone
+    expect_fits(page)
 
 
 def test_a_dialog(tab: Tab) -> None:

@@ -10,7 +10,7 @@ from playwright.sync_api import expect
 
 from policy_league_client import Client
 from serve_app.runtime import serve_bypass
-from tests.support.clients.browsers import Served, Tab
+from tests.support.clients.browsers import Served, Tab, use_key
 from tests.support.leagues import tictactoe
 from tests.support.leagues.browser_leagues import CONNECT_FOUR, RUN, verdict_between_versions
 from tests.support.leagues.tictactoe import LEAGUE
@@ -62,6 +62,7 @@ def test_links_lead_to_pages_below_the_prefix(tab: Tab, proxied: Proxy) -> None:
     page.get_by_role("link", name=re.compile("tictactoe@3 scores .* against script:random")).click()
     page.get_by_role("link", name=re.compile("^Match ")).first.click()
     page.get_by_role("link", name="Game 1").click()
+    expect(page.get_by_role("heading", level=2)).to_have_text("Game 1")
     page.reload()
     expect(page.get_by_role("heading", level=2)).to_have_text("Game 1")
     page.get_by_role("link", name="Policy League").click()
@@ -77,9 +78,7 @@ def test_event_streams_and_changes_pass_the_proxy(tab: Tab, served: Served, prox
     expect(champion).to_contain_text(f"{LEAGUE}@3")
     served.registry.aliases.set(LEAGUE, "champion", 2, expected=3, actor="cli", reason="from elsewhere")
     expect(champion).to_contain_text(f"{LEAGUE}@2")
-    page.get_by_role("button", name=re.compile("^API key")).click()
-    page.get_by_role("dialog").get_by_label("Key", exact=True).fill(served.keys["everything"])
-    page.get_by_role("button", name="Use key").click()
+    use_key(page, served.keys["everything"])
     page.get_by_role("button", name="Roll back …").click()
     page.get_by_label("Reason").fill("as it was")
     page.get_by_role("button", name="Roll back to @3").click()
@@ -114,6 +113,7 @@ def test_a_proxy_that_leaves_the_prefix_needs_the_root_path(
         expect(page.locator(".properties")).to_contain_text(f"{LEAGUE}@1")
         page.get_by_role("link", name="History").click()
         page.reload()
+        expect(page.get_by_role("table")).to_contain_text("the first")
         registry.aliases.set(LEAGUE, "champion", 2, expected=1, actor="cli", reason="the second")
         expect(page.get_by_role("table")).to_contain_text("the second")  # by an event
         page.goto(f"{proxied.url}/docs")

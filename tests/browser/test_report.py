@@ -13,15 +13,15 @@ from playwright.sync_api import Browser, Page, expect
 from evaluation.documents import Difference
 from league.registry.registry import Registry
 from policy_league.cli.evaluation.report_contents import MOST_BYTES, MOST_VERDICTS, league_report, report_file
-from tests.support.clients.browsers import serious
+from tests.support.clients.browsers import TIMEOUT, expect_finished, expect_fits, resize, serious
 from tests.support.leagues import reported_league
 from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.reports import exploitability_report
+from tests.support.waiting import until
 
 pytestmark = pytest.mark.slow  # a browser takes all cores
 
 BASE = f"/v1/leagues/{LEAGUE}"
-TIMEOUT = 20_000
 TABS = ["Leaderboard", "Payoff matrix", "Upsets", "Versions", "Verdicts", "History"]
 Open = Callable[[dict[str, Any]], Page]
 
@@ -44,7 +44,6 @@ def opened(browser: Browser, tmp_path: Path) -> Iterator[Open]:
     context = browser.new_context(viewport={"width": 1180, "height": 800})
     context.set_offline(True)
     context.set_default_timeout(TIMEOUT)
-    expect.set_options(timeout=TIMEOUT)
     problems: list[str] = []
     requests: list[str] = []
 
@@ -67,6 +66,7 @@ def opened(browser: Browser, tmp_path: Path) -> Iterator[Open]:
 def select(page: Page, tab: str) -> Page:
     page.get_by_role("navigation", name=f"Pages of {LEAGUE}").get_by_role("link", name=tab, exact=True).click()
     expect(page.get_by_role("heading", level=2, name=tab, exact=True)).to_be_visible()
+    expect_finished(page)
     return page
 
 
@@ -89,10 +89,9 @@ def test_all_results_are_on_its_pages(opened: Open, report: dict[str, Any]) -> N
         assert serious(page) == []
         for offer in ("Promote …", "Roll back …", "Edit …", "API key", "Start an evaluation"):
             expect(page.get_by_text(offer)).to_have_count(0)
-    page.set_viewport_size({"width": 360, "height": 740})
+    resize(page, 360)
     for tab in TABS:
-        select(page, tab)
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{tab} scrolls horizontally"
+        expect_fits(select(page, tab))
 
 
 def test_every_link_leads_to_a_page_of_the_report(opened: Open, report: dict[str, Any]) -> None:
@@ -101,8 +100,9 @@ def test_every_link_leads_to_a_page_of_the_report(opened: Open, report: dict[str
     while waiting:
         address, *others = waiting
         page.evaluate("hash => { location.hash = hash }", address)
+        page.reload()  # the page before would satisfy what follows
+        expect_finished(page)
         expect(page.locator("main section")).to_be_visible()
-        expect(page.locator(".loading")).to_have_count(0)
         expect(page.locator("main")).not_to_contain_text(re.compile("does not contain|not found"))
         links = set(page.locator("a:not(.skip-link)").evaluate_all("links => links.map(link => link.hash)"))
         waiting, visited = {*others, *links - visited}, visited | links
@@ -121,7 +121,7 @@ def test_the_address_and_the_history_of_the_browser_select_pages(opened: Open, r
     page.reload()
     expect(page.get_by_text("Stronger: ")).to_be_visible()
     expect(page.locator("canvas")).to_be_visible()
-    assert page.title() == f"@3 against @2 · {LEAGUE} · Policy League"
+    expect(page).to_have_title(f"@3 against @2 · {LEAGUE} · Policy League")
 
 
 def test_an_upset_is_shown_step_by_step(opened: Open, report: dict[str, Any]) -> None:
@@ -209,11 +209,13 @@ def test_it_is_printed_in_light_colours_without_navigation(opened: Open, report:
     page = opened(report)
     background = "getComputedStyle(document.body).backgroundColor"
     light = page.evaluate(background)
-    for _ in range(2):
-        page.get_by_role("button", name="Theme").click()
-    assert page.evaluate(background) != light, "dark"
+    theme = page.get_by_role("button", name="Theme")
+    theme.click()
+    theme.click()
+    expect(theme).to_have_accessible_name("Theme: dark")
+    assert page.evaluate(background) != light
     page.emulate_media(media="print")
-    assert page.evaluate(background) == light
+    until(lambda: page.evaluate(background) == light)
     expect(page.locator(".tabs")).to_be_hidden()
     expect(page.locator(".header")).to_be_hidden()
     expect(page.get_by_role("row", name=re.compile("tictactoe@3"))).to_be_visible()
