@@ -13,6 +13,7 @@ import re
 from base64 import b64encode
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -114,8 +115,9 @@ class StaticFile:
     etag: str
 
     @classmethod
+    @cache
     def of(cls, path: Path, plain: bytes) -> StaticFile:
-        """Compress the content of a file."""
+        """Compress the content of a file, once in a process: several replicas may share it, in tests hundreds do."""
         zipped = gzip.compress(plain, mtime=0) if len(plain) >= MIN_COMPRESSED_BYTES else None
         return cls(plain, zipped, MEDIA_TYPES[path.suffix], f'W/"{sha256(plain).hexdigest()[:24]}"')
 
