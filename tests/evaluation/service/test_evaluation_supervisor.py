@@ -17,6 +17,7 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import EvaluationRow
 from league.results.ledger import Ledger
 from league.settings import Storage
+from league.subprocesses import Subprocess
 from tests.support.databases import StorageAt, on_both_databases
 from tests.support.leagues import tictactoe
 from tests.support.processes import running_module
@@ -42,6 +43,7 @@ def registry(tmp_path: Path, storage_at: StorageAt, monkeypatch: pytest.MonkeyPa
     opened = copy_of(_with_two_versions, storage_at(tmp_path / "home"))
     for name, value in opened.storage.environment.items():
         monkeypatch.setenv(name, value)
+    monkeypatch.setattr(evaluation_supervisor, "POLL_INTERVAL", 0.02)
     yield opened
     opened.close()
 
@@ -89,15 +91,15 @@ def test_workers_are_tasks_of_the_ray_cluster_that_the_process_joins(registry: R
 
 
 def test_an_evaluation_that_does_not_stop_is_killed(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluation_supervisor, "STOP_TIMEOUT", timedelta(seconds=0.5))
+    monkeypatch.setattr(evaluation_supervisor, "STOP_TIMEOUT", timedelta(seconds=0.1))
     change_environment(registry, "Hanging")
     evaluation = submit(registry, blocks=8)
-    with running(registry):
+    with running(registry) as supervisor:
         until(lambda: evaluation().progress is not None)
-        (process,) = running_module("evaluation.service.evaluation_job")
+        (job,) = supervisor._jobs
         registry.evaluations.stop(tictactoe.LEAGUE, evaluation().id, actor="ada")
         until(lambda: evaluation().state == "stopped")
-        assert process not in running_module("evaluation.service.evaluation_job")
+        assert not job.process.is_running
 
 
 def test_an_exception_of_the_environment_is_reported(registry: Registry) -> None:
@@ -140,8 +142,7 @@ def test_an_evaluation_continues_after_its_service_was_killed(registry: Registry
 
 
 def test_an_evaluation_whose_process_dies_repeatedly_fails(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "executable", "/bin/false")
-    monkeypatch.setattr(evaluation_supervisor, "POLL_INTERVAL", 0.01)
+    monkeypatch.setattr(evaluation_supervisor, "Subprocess", lambda *_: Subprocess("no_such_module"))
     evaluation = submit(registry, blocks=8)
     with running(registry):
         until(lambda: evaluation().state == "failed")

@@ -7,9 +7,11 @@ import errno
 import json
 import os
 import signal
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from io import BytesIO
+from pathlib import Path
 from typing import Any, NoReturn
 
 import pytest
@@ -43,9 +45,11 @@ from league.service_requests import (
 )
 from tests.support.leagues import tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
-from tests.support.processes import running_module
+from tests.support.waiting import until
 
-LONG = 120.0
+LONG = 240.0
+HASTY, GRACE = 1.0, 0.5
+"""Seconds for a game that does not end, and until its process is killed."""
 
 
 @pytest.fixture(scope="module")
@@ -66,19 +70,30 @@ def registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
     opened.close()
 
 
-@contextmanager
-def running(**settings: Any) -> Iterator[GameWorkerPool]:
-    pool = GameWorkerPool(**settings)
-    try:
-        yield pool
-    finally:
-        pool.close()
-
-
 @pytest.fixture(scope="module")
-def shared(registry: Registry) -> Iterator[GameWorkerPool]:
-    with running() as pool:
-        yield pool
+def pool(registry: Registry) -> Iterator[GameWorkerPool]:
+    """One for all tests: each of its processes imports for a second or two. Two leagues have games that do not end."""
+    pool = GameWorkerPool(seconds=HASTY, grace=GRACE, most=16)
+    for league in ("hanging", "blockingsignals"):
+        pool._worker(league)
+    pool._seconds = LONG
+    yield pool
+    pool.close()
+
+
+def process_of(pool: GameWorkerPool, league: str = LEAGUE) -> int:
+    pid = pool._workers[league]._process.pid
+    assert pid is not None
+    return pid
+
+
+@pytest.fixture
+def pause(pool: GameWorkerPool) -> Iterator[threading.Event]:
+    """Requests for games of tic-tac-toe wait until it is set."""
+    event = threading.Event()
+    pool._worker(LEAGUE)._thread.submit(event.wait)
+    yield event
+    event.set()
 
 
 def game_request(operation: Any, league: str = LEAGUE) -> GameRequest:
@@ -100,8 +115,8 @@ def document_of(answer: GameResponse) -> dict[str, Any]:
     return dict(json.loads(answer.content))
 
 
-def test_playable_agents_are_listed(shared: GameWorkerPool) -> None:
-    assert document_of(submit(shared, PlayabilityRequest())) == {
+def test_playable_agents_are_listed(pool: GameWorkerPool) -> None:
+    assert document_of(submit(pool, PlayabilityRequest())) == {
         "league": LEAGUE,
         "playable": True,
         "why": None,
@@ -126,181 +141,175 @@ def test_playable_agents_are_listed(shared: GameWorkerPool) -> None:
 
 
 def test_a_pool_is_in_use_for_some_minutes_after_a_request(
-    shared: GameWorkerPool, monkeypatch: pytest.MonkeyPatch
+    pool: GameWorkerPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    submit(shared, PlayabilityRequest())
-    assert shared.is_in_use
+    submit(pool, PlayabilityRequest())
+    assert pool.is_in_use
     monkeypatch.setattr(game_worker_pool, "IDLE", 0.0)
-    submit(shared, PlayabilityRequest())
-    assert not shared.is_in_use
+    submit(pool, PlayabilityRequest())
+    assert not pool.is_in_use
 
 
-def test_a_process_that_cannot_be_started_is_tried_again(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> NoReturn:
-        raise OSError(errno.EAGAIN, "no more processes")
-
-    with running() as pool:
-        with monkeypatch.context() as patched:
-            patched.setattr(subprocesses, "Subprocess", fail)
-            with pytest.raises(OSError, match="no more processes"):
-                submit(pool, PlayabilityRequest())
-        assert document_of(submit(pool, PlayabilityRequest()))["playable"] is True
-
-
-def test_a_recorded_game_has_images_and_a_video(shared: GameWorkerPool, registry: Registry) -> None:
+def test_a_recorded_game_has_images_and_a_video(pool: GameWorkerPool, registry: Registry) -> None:
     match = Ledger(registry).matches(league=LEAGUE)[0]
-    record = document_of(submit(shared, RecordingRequest(match=match.id, game=1, first=1, end=3)))
+    record = document_of(submit(pool, RecordingRequest(match=match.id, game=1, first=1, end=3)))
     assert [step["step"] for step in record["steps"]] == [1, 2]
     assert all(step["picture"].startswith("data:image/png;base64,") for step in record["steps"])
-    video = submit(shared, VideoRequest(match=match.id, game=1))
+    video = submit(pool, VideoRequest(match=match.id, game=1))
     assert video.media_type == "image/gif"
     assert Image.open(BytesIO(video.content)).n_frames == record["length"] + 1
 
 
-def test_a_game_against_a_version_is_played(shared: GameWorkerPool) -> None:
-    state = document_of(submit(shared, play_request(4)))
+def test_a_game_against_a_version_is_played(pool: GameWorkerPool) -> None:
+    state = document_of(submit(pool, play_request(4)))
     assert [step["moves"][0]["action"] for step in state["steps"][1:]] == [4, state["steps"][2]["moves"][0]["action"]]
     assert state["picture"].startswith("data:image/png;base64,")
     assert state["chances"][0][0] in state["legal"]
-    processes = running_module("evaluation.service.game_worker")
-    submit(shared, play_request(5))
-    assert running_module("evaluation.service.game_worker") == processes, "one process per league"
+    process = process_of(pool)
+    submit(pool, play_request(5))
+    assert process_of(pool) == process, "one process per league"
 
 
-def test_errors_keep_their_type(shared: GameWorkerPool) -> None:
+def test_errors_keep_their_type(pool: GameWorkerPool) -> None:
     for operation, error, message in (
         (play_request(4, 4), IllegalAction, r"actions\[1\]: 4 is illegal"),
         (play_request(opponent="tictactoe@9"), UnknownVersion, "tictactoe"),
         (VideoRequest(match="nowhere/0", game=0), NotFound, "nowhere"),
     ):
         with pytest.raises(error, match=message):
-            submit(shared, operation)
+            submit(pool, operation)
 
 
-def test_immutable_answers_are_cached(shared: GameWorkerPool) -> None:
-    assert submit(shared, play_request(4)) is submit(shared, play_request(4))
-    assert submit(shared, PlayabilityRequest()) is not submit(shared, PlayabilityRequest())
+def test_immutable_answers_are_cached(pool: GameWorkerPool) -> None:
+    assert submit(pool, play_request(4)) is submit(pool, play_request(4))
+    assert submit(pool, PlayabilityRequest()) is not submit(pool, PlayabilityRequest())
 
 
-def test_a_slow_request_can_be_repeated(registry: Registry) -> None:
-    with running() as pool:
+def test_a_slow_request_can_be_repeated(
+    pool: GameWorkerPool, pause: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def submit_twice() -> GameResponse:
+        request = game_request(play_request(0, seed=1))
+        with pytest.raises(NotReady, match="of tictactoe is starting or busy: repeat the request for its response"):
+            await pool.submit(request, timeout=0.0)
+        monkeypatch.setattr(game_worker_pool, "MOST_WAITING", 0)  # the repetition is no further request
+        pause.set()
+        return await pool.submit(request, LONG)
 
-        async def submit_until_ready() -> tuple[set[str], GameResponse]:
-            messages = set()
-            while True:
-                try:
-                    return messages, await pool.submit(game_request(play_request(0)), timeout=0.05)
-                except NotReady as error:
-                    messages.add(str(error))
-
-        messages, answer = asyncio.run(submit_until_ready())
-    # A process takes longer than 50 ms to start.
-    assert messages == {"the environment of tictactoe is starting or busy: repeat the request for its response"}
-    assert document_of(answer)["over"] is False
+    assert document_of(asyncio.run(submit_twice()))["over"] is False
 
 
-def test_a_hanging_game_is_aborted_and_others_are_played(registry: Registry) -> None:
-    with running(seconds=5.0) as pool:
+def test_a_hanging_game_is_aborted_and_others_are_played(pool: GameWorkerPool) -> None:
+    async def both() -> None:
+        hung = asyncio.create_task(
+            pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), LONG)
+        )
+        await pool.submit(game_request(play_request(0)), LONG)
+        with pytest.raises(GameHung, match=f"a game of hanging did not end within {HASTY:g} s"):
+            await hung
+        with pytest.raises(NotReady):  # the hang is not cached
+            await pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), 0.0)
 
-        async def both() -> None:
-            hung = asyncio.create_task(
-                pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), LONG)
-            )
-            await pool.submit(game_request(play_request(0)), LONG)
-            with pytest.raises(GameHung, match="a game of hanging did not end within 5 s"):
-                await hung
-            with pytest.raises(NotReady):  # the hang is not cached
-                await pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), 0.01)
-
-        asyncio.run(both())
+    asyncio.run(both())
 
 
-def test_native_code_that_does_not_return_ends_the_process(registry: Registry) -> None:
-    with running(seconds=5.0, grace=1.0) as pool:
-        with pytest.raises(GameHung, match="its process was killed after 6 s"):
-            submit(pool, play_request(0, opponent="script:random"), "blockingsignals")
-        assert document_of(submit(pool, PlayabilityRequest(), "blockingsignals"))["playable"]
+def is_playable_in_time(pool: GameWorkerPool, league: str) -> bool:
+    """Whether the process of a hasty league has imported all that its games need. What was interrupted is repeated."""
+    try:
+        return bool(document_of(submit(pool, PlayabilityRequest(), league))["playable"])
+    except (GameHung, GameCrashed):
+        return False
 
 
-def test_a_process_that_dies_is_reported_and_replaced(registry: Registry) -> None:
-    with running() as pool:
-        with pytest.raises(WorkerLost, match="plays games of dying died"):
-            submit(pool, play_request(0, opponent="script:random"), "dying")
-        assert document_of(submit(pool, PlayabilityRequest(), "dying"))["playable"]
-        (process,) = running_module("evaluation.service.game_worker")[-1:]
-        os.kill(process, signal.SIGKILL)
-        assert document_of(submit(pool, play_request(opponent="script:random"), "dying"))["legal"]
+def test_native_code_that_does_not_return_ends_the_process(pool: GameWorkerPool) -> None:
+    until(lambda: is_playable_in_time(pool, "blockingsignals"))
+    with pytest.raises(GameHung, match=f"its process was killed after {HASTY + GRACE:g} s"):
+        submit(pool, play_request(0, opponent="script:random"), "blockingsignals")
+    until(lambda: is_playable_in_time(pool, "blockingsignals"))
 
 
-def test_an_exception_of_the_environment_is_reported_and_the_next_game_is_independent(shared: GameWorkerPool) -> None:
+def test_a_process_that_dies_is_reported_and_replaced(pool: GameWorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> NoReturn:
+        raise OSError(errno.EAGAIN, "no more processes")
+
+    with pytest.raises(WorkerLost, match="plays games of dying died"):
+        submit(pool, play_request(0, opponent="script:random"), "dying")
+    with monkeypatch.context() as patched:
+        patched.setattr(subprocesses, "Subprocess", fail)
+        with pytest.raises(OSError, match="no more processes"):
+            submit(pool, PlayabilityRequest(), "dying")
+    assert document_of(submit(pool, PlayabilityRequest(), "dying"))["playable"]
+    os.kill(process_of(pool, "dying"), signal.SIGKILL)
+    assert document_of(submit(pool, play_request(opponent="script:random"), "dying"))["legal"]
+
+
+def test_an_exception_of_the_environment_is_reported_and_the_next_game_is_independent(pool: GameWorkerPool) -> None:
     for _ in range(2):
         with pytest.raises(GameCrashed, match="the board is gone"):
-            submit(shared, play_request(0, opponent="script:random"), "raising")
-    assert document_of(submit(shared, play_request(opponent="script:random"), "raising"))["legal"] == list(range(9))
+            submit(pool, play_request(0, opponent="script:random"), "raising")
+    assert document_of(submit(pool, play_request(opponent="script:random"), "raising"))["legal"] == list(range(9))
 
 
-def test_an_environment_that_cannot_be_created_is_a_server_error(shared: GameWorkerPool, registry: Registry) -> None:
-    lost = tictactoe.config(league="lost", environment={"entry_point": "games.none:none"})
-    registry.leagues.register(lost, registry.leagues.get(LEAGUE).interface)
-    with pytest.raises(GameCrashed, match=r"the environment of lost cannot be created: .*games\.none"):
-        submit(shared, PlayabilityRequest(), "lost")
+def test_a_changed_environment_is_used_for_the_next_game(pool: GameWorkerPool, registry: Registry) -> None:
+    """Also after one that cannot be created, which is a server error."""
 
-
-def test_a_changed_environment_is_used_for_the_next_game(registry: Registry) -> None:
-    league = tictactoe.config(league="moving")
-    registry.leagues.register(league, interface(league))
-    with running() as pool:
+    def play(conditions: str, entry_point: str) -> GameResponse:
+        config = tictactoe.config(league="moving", environment={"entry_point": entry_point})
+        registry.leagues.register(config, registry.leagues.get(LEAGUE).interface)
         operation = play_request(0, opponent="script:first")
-        assert len(document_of(submit(pool, operation, "moving"))["steps"]) == 3
-        other = tictactoe.config(
-            league="moving", environment={"entry_point": "tests.support.environments.hanging:Raising"}
-        )
-        registry.leagues.register(other, interface(other))
-        with pytest.raises(GameCrashed):
-            asyncio.run(pool.submit(GameRequest(league="moving", conditions="2-greedy", operation=operation), LONG))
+        request = GameRequest(league="moving", conditions=conditions, operation=operation)
+        return asyncio.run(pool.submit(request, LONG))
+
+    with pytest.raises(GameCrashed, match=r"the environment of moving cannot be created: .*games\.none"):
+        play("1-greedy", "games.none:none")
+    assert len(document_of(play("2-greedy", "pettingzoo.classic.tictactoe_v3"))["steps"]) == 3
+    with pytest.raises(GameCrashed, match="the board is gone"):
+        play("3-greedy", "tests.support.environments.hanging:Raising")
 
 
 def test_idle_leagues_are_evicted_but_not_during_a_game(registry: Registry) -> None:
-    with running(most=1, seconds=5.0) as pool:
+    with closing(GameWorkerPool(most=1)) as pool:
 
-        async def submit_several() -> None:
-            hung = asyncio.create_task(
-                pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), LONG)
-            )
+        async def submit_several() -> int:
+            playing = asyncio.create_task(pool.submit(game_request(PlayabilityRequest(), "raising"), LONG))
             await asyncio.sleep(0)
             with pytest.raises(Overloaded, match="all 1 processes for games are in use by other leagues"):
                 await pool.submit(game_request(PlayabilityRequest()), LONG)
-            with pytest.raises(GameHung):
-                await hung
-            await pool.submit(game_request(PlayabilityRequest()), LONG)
+            await playing
+            process = process_of(pool, "raising")
+            with pytest.raises(NotReady):
+                await pool.submit(game_request(PlayabilityRequest()), 0.0)
+            return process
 
-        before = running_module("evaluation.service.game_worker")
-        asyncio.run(submit_several())
-        assert len(set(running_module("evaluation.service.game_worker")) - set(before)) == 1
+        assert not Path(f"/proc/{asyncio.run(submit_several())}").exists()
 
 
-def test_the_number_of_waiting_requests_is_limited(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_waiting_requests_is_limited(
+    pool: GameWorkerPool, pause: threading.Event, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(game_worker_pool, "MOST_WAITING", 2)
-    with running() as pool:
 
-        async def submit_many() -> list[Any]:
-            requests = [pool.submit(game_request(play_request(seed=seed)), LONG) for seed in range(3)]
-            return list(await asyncio.gather(*requests, return_exceptions=True))
+    async def submit_many() -> None:
+        first, second, third = (game_request(play_request(seed=seed)) for seed in range(3))
+        waiting = [asyncio.create_task(pool.submit(request, LONG)) for request in (first, second)]
+        await asyncio.sleep(0)
+        with pytest.raises(Overloaded):
+            await pool.submit(third, LONG)
+        pause.set()
+        await asyncio.gather(*waiting)
 
-        *answered, rejected = asyncio.run(submit_many())
-    assert all(isinstance(each, GameResponse) for each in answered)
-    assert isinstance(rejected, Overloaded)
+    asyncio.run(submit_many())
 
 
-def test_the_size_of_the_cache_is_limited(shared: GameWorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = submit(shared, play_request(1))
+def test_the_size_of_the_cache_is_limited(pool: GameWorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = submit(pool, play_request(1))
     monkeypatch.setattr(game_worker_pool, "CACHE_BYTES", len(first.content))
-    submit(shared, play_request(2))
-    submit(shared, play_request(3))
-    assert submit(shared, play_request(1)) is not first
+    submit(pool, play_request(2))
+    submit(pool, play_request(3))
+    assert submit(pool, play_request(1)) is not first
 
 
-def test_only_leagues_with_discrete_actions_are_playable(registry: Registry, shared: GameWorkerPool) -> None:
+def test_only_leagues_with_discrete_actions_are_playable(registry: Registry, pool: GameWorkerPool) -> None:
     config = tictactoe.config(
         league="spread",
         environment={
@@ -310,8 +319,8 @@ def test_only_leagues_with_discrete_actions_are_playable(registry: Registry, sha
         play={"opening_plies": 0},
     )
     registry.leagues.register(config, interface(config))
-    document = document_of(submit(shared, PlayabilityRequest(), "spread"))
+    document = document_of(submit(pool, PlayabilityRequest(), "spread"))
     assert (document["playable"], document["agents"]) == (False, [])
     assert document["why"] == "human play needs Discrete actions, but its agents have Box"
     with pytest.raises(EnvironmentMismatch, match="agent_0 has Box"):
-        submit(shared, play_request(opponent="script:random", agent="agent_0"), "spread")
+        submit(pool, play_request(opponent="script:random", agent="agent_0"), "spread")

@@ -17,6 +17,7 @@ from evaluation.service.snapshot_refresher import SnapshotRefresher
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.registry.snapshots import SnapshotRepository
+from league.subprocesses import RequestProcess
 from tests.support.leagues import tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.processes import running_module
@@ -28,7 +29,7 @@ def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Regist
     opened = tictactoe.registry(tmp_path / "home")
     for name, value in opened.storage.environment.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(snapshot_refresher, "POLL_INTERVAL", 0.1)
+    monkeypatch.setattr(snapshot_refresher, "POLL_INTERVAL", 0.05)
     monkeypatch.setattr(snapshot_refresher, "IDLE_FACTOR", 0)
     yield opened
     opened.close()
@@ -54,6 +55,10 @@ def play(registry: Registry, seed: int) -> int:
     return evaluate(LEAGUE, ["script:random", "script:first"], registry=registry, blocks=2, seed=seed).games
 
 
+def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.module == "snapshot_refresher"]
+
+
 def games(registry: Registry) -> int:
     row = registry.snapshots.get(LEAGUE, "summary")
     return row.document["games"] if row else 0
@@ -68,7 +73,7 @@ def test_snapshots_follow_the_ledger(registry: Registry, caplog: pytest.LogCaptu
         until(lambda: games(registry) == first + second)
         assert refresher.is_alive()
     assert not refresher.is_alive()
-    assert "failed" not in caplog.text, "processes exit with status 0"
+    assert errors(caplog) == [], "processes exit with status 0"
 
 
 @pytest.mark.slow
@@ -84,14 +89,15 @@ def test_a_league_whose_process_fails_is_delayed_and_the_others_are_refreshed(
     registry: Registry, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     another_league(registry, "chess")
-    monkeypatch.setattr(sys, "executable", "/bin/false")
+    process = RequestProcess("no_such_module", work="computes nothing")
+    monkeypatch.setattr(snapshot_refresher, "RequestProcess", lambda *_, **__: process)
     checks = []
     stale = registry.snapshots.stale
     monkeypatch.setattr(registry.snapshots, "stale", lambda: checks.append(1) or stale())
     with caplog.at_level(logging.ERROR), running(registry):
         until(lambda: len(checks) > 6)
-    failed = [record.args[0] for record in caplog.records if "failed" in record.message and record.args]
-    assert sorted(failed) == ["chess", LEAGUE]
+    failed = sorted(message.partition(" failed")[0] for message in errors(caplog))
+    assert failed == [f"computing the snapshots of league {name}" for name in ("chess", LEAGUE)]
 
 
 def test_refreshing_resumes_when_the_database_is_back(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:
@@ -110,7 +116,7 @@ def test_refreshing_resumes_when_the_database_is_back(registry: Registry, caplog
 def test_an_evaluation_service_works_until_snapshots_are_current(
     registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(deployment, "POLL", 0.1)
+    monkeypatch.setattr(deployment, "POLL", 0.05)
     service = EvaluationService(workers=1, at_once=1)
     play(registry, seed=1)
     asyncio.run(service.work())
