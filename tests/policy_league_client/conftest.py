@@ -9,21 +9,30 @@ import pytest
 
 from league.registry.registry import Registry
 from league.settings import Storage
-from policy_league_client import AsyncClient, Client
+from policy_league_client import AsyncClient, Client, retries
 from tests.support.clients.sync_and_async import SETTINGS, Connect, Synchronous
 from tests.support.leagues.protocol_leagues import every_kind
 from tests.support.leagues.served_leagues import everything
 from tests.support.servers.streaming import Listening, listening
 
+PATIENCE = 240.0
+"""Seconds for what succeeds."""
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine, a replica that listens may not be ready for more than a second."""
+    monkeypatch.setattr(retries, "NOT_READY_DEADLINE", PATIENCE)
+
 
 @pytest.fixture(params=[Client, AsyncClient], ids=["sync", "async"])
 def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
-    """Creates clients of both kinds."""
+    """Creates clients of both kinds, which wait for as long as a busy machine may take."""
     clients: list[Any] = []
     with asyncio.Runner() as runner:
 
         def connect_client(*args: Any, **options: Any) -> Any:
-            client = request.param(*args, **options)
+            client = request.param(*args, **{"timeout": PATIENCE, "retry_deadline": PATIENCE, **options})
             clients.append(Synchronous(client, runner) if request.param is AsyncClient else client)
             return clients[-1]
 

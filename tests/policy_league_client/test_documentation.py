@@ -15,11 +15,13 @@ import yaml
 
 from league.config.league import LeagueConfig
 from league.environments.building import interface
+from league.environments.external import advertisement
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import BatchedEnvironment, each_agent_alone
 from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry
 from league.settings import Storage
+from policy_league_client import simulator
 from serve_app.inference.stream_codec import RESPONSE, encode_request
 from tests.support.servers.streaming import connect_four_server, listening
 
@@ -53,6 +55,8 @@ def test_snippets_run_in_order(
 
 def test_simulators_play_as_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The league is valid, and both programs play its episodes."""
+    monkeypatch.setattr(simulator, "MAX_DELAY", 0.02)
+    monkeypatch.setattr(advertisement, "INTERVAL", 0.02)
     page = "docs/simulators.md"
     config = LeagueConfig.from_mapping(yaml.safe_load(snippets(page, "yaml")[0]))
     registry = Registry.open(Storage.at(tmp_path))

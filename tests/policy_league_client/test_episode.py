@@ -7,6 +7,7 @@ import pytest
 
 from league.errors import InvalidReference, UnknownLeague, UnknownVersion, VersionRetired
 from league.registry.registry import Registry
+from serve_app.runtime.haproxy import free_ports
 from tests.support.clients.actions import BOARD
 from tests.support.clients.sync_and_async import Connect
 from tests.support.leagues.served_leagues import promote
@@ -62,12 +63,12 @@ def test_an_exploring_episode_is_reproducible(connect: Connect, url: str) -> Non
 
 
 def test_an_episode_survives_its_replica_but_not_its_version(connect: Connect, registry: Registry) -> None:
-    with listening(registry.storage) as first:
-        client = connect(first.url, retry_deadline=20)
+    (port,) = free_ports(1, "127.0.0.1")
+    with listening(registry.storage, port=port) as first:
+        client = connect(first.url)
         episode, other = client.episode("memory"), client.episode("board@3")
         assert [episode.act(ONE) for _ in range(2)] == [0, 0]
         other.act(BOARD)
-        port = int(first.url.rsplit(":")[-1])
     shutil.rmtree(registry.artifacts.path("board", 3))
     with listening(registry.storage, replica="replica-2", port=port):
         assert episode.act(ONE) == 1

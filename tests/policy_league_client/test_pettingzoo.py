@@ -176,14 +176,16 @@ def test_each_agent_has_its_own_recurrent_state(client: Client) -> None:
 
 def test_a_promotion_during_an_episode_changes_no_player(client: Client, registry: Registry) -> None:
     steps = []
-    for step in play(tictactoe_v3.env(), client, {"player_1": "tictactoe", "player_2": "tictactoe"}, seed=3):
-        if not steps:
-            promote(registry, "tictactoe", 2)
-            seen = deepcopy(step.observation)
-            until(lambda seen=seen: client.act("tictactoe", seen).version == 2)
-        steps.append(step)
-    promote(registry, "tictactoe", 1)
-    registry.changes.wait_for_alias(registry.aliases.history("tictactoe")[0], 30)
+    try:
+        for step in play(tictactoe_v3.env(), client, {"player_1": "tictactoe", "player_2": "tictactoe"}, seed=3):
+            if not steps:
+                promote(registry, "tictactoe", 2)
+                seen = deepcopy(step.observation)
+                until(lambda seen=seen: client.act("tictactoe", seen).version == 2)
+            steps.append(step)
+    finally:
+        promote(registry, "tictactoe", 1)
+        registry.changes.wait_for_alias(registry.aliases.history("tictactoe")[0], 240)
     assert {step.response.version for step in steps if step.response} == {1}
 
 
