@@ -49,7 +49,7 @@ def without_failures(url: str) -> Iterator[Load]:
     """Call without pause while the context lasts, and assert that no call has failed."""
 
     def caller() -> Callable[[], int]:
-        client = Client(url)
+        client = Client(url, retry_deadline=60.0)  # a busy machine may replace a process slowly
         return lambda: client.act("board", BOARD).version
 
     with load(caller, callers=4) as result:
@@ -71,7 +71,8 @@ def kill(registry: Registry, name: str, count: int | None = None) -> None:
     victims = running_before[:count]
     assert victims
     for pid in victims:
-        os.kill(pid, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
     until(lambda: len(set(processes(registry.storage, name)) - set(victims)) >= len(running_before))
 
 
@@ -117,8 +118,9 @@ def test_a_moved_database(url: str, registry: Registry) -> None:
     path = registry.storage.home / "league.db"
     with without_failures(url) as result, httpx.Client(base_url=url) as client:
         path.rename(path.with_name("away"))
-        until(lambda: client.get("/v1/leagues").json().get("code") == "storage_error")
-        assert client.get("/v1/leagues").status_code == 503
+        # A replica may still answer from an open connection when the other one does not.
+        until(lambda: all(client.get("/v1/leagues").status_code == 503 for _ in range(8)))
+        assert client.get("/v1/leagues").json()["code"] == "storage_error"
         assert client.get("/v1/health/ready").status_code == 200
         kill(registry, "PolicyServer", 1)  # its replacement must not create a new database
         wait_for_calls(result, 500)

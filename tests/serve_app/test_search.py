@@ -1,8 +1,10 @@
 """Search versions are served like others, by the search service."""
 
+import asyncio
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from league.search.policies import contestant, publish_search
+from league.settings import Storage
 from league.spaces import ACTION_MASK, OBSERVATION
 from policy_league_client.requests import ActionRequest, BatchActionRequest
 from policy_league_client.responses import parse_action_response, parse_batch_action_response
@@ -25,18 +28,25 @@ from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.exposition import value
 from tests.support.servers.local_search import LocalHandle, searching_replica, searching_server
 from tests.support.servers.protocol_servers import Listening
-from tests.support.servers.replicas import QUICK, replica
+from tests.support.servers.replicas import QUICK, local_client, replica
+from tests.support.templates import copy_of
 from tests.support.waiting import until
 
 GAMES = [(), (0, 4), (0, 1, 3, 4), (4, 0, 8, 2)]
 SEARCH = 2
 SLOW = 3
+PATIENT = QUICK.model_copy(update={"timeout": 120.0, "run_timeout": 60.0})
+"""The thread that searches has a low priority, and waits long on a busy machine."""
 
 
 @pytest.fixture
 def registry(tmp_path: Path) -> Registry:
+    return copy_of(build_searching, Storage.at(tmp_path / "home"))
+
+
+def build_searching(storage: Storage) -> Registry:
     """Version 2 searches with version 1, the champion; version 3 does so for a long time."""
-    opened = tictactoe.registry(tmp_path / "home", gate={"max_blocks": 4})
+    opened = tictactoe.registry(storage.home, gate={"max_blocks": 4})
     tictactoe.publish(opened, masked_mlp((3, 3, 2), 9), value=masked_mlp((3, 3, 2), 9, has_value=True))
     league, base = opened.leagues.get(LEAGUE), opened.versions.get(LEAGUE, 1)
     for simulations in (50, 10_000):
@@ -47,7 +57,7 @@ def registry(tmp_path: Path) -> Registry:
 
 @pytest.fixture
 def served(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[TestClient, LocalHandle]]:
-    with searching_replica(registry, monkeypatch) as served:
+    with searching_replica(registry, monkeypatch, PATIENT) as served:
         yield served
 
 
@@ -102,7 +112,7 @@ def test_all_protocols_return_the_actions_of_the_search(
 
 def test_triton_clients_call_it_by_grpc(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     arrays = {name: np.array([board[name] for board in BOARDS], dtype=np.int8) for name in BOARDS[0]}
-    server, _ = searching_server(registry, monkeypatch)
+    server, _ = searching_server(registry, monkeypatch, PATIENT)
     with Listening(server) as address, Triton("grpc", address) as triton:
         result = triton.infer(LEAGUE, arrays, version=str(SEARCH), outputs=("action", "action_dist_inputs"))
     expected = searched(registry).act(arrays)
@@ -208,22 +218,36 @@ def test_a_call_whose_process_ends_is_repeated(served: tuple[TestClient, LocalHa
 
 
 def test_requests_that_wait_together_share_a_message(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    league, base = registry.leagues.get(LEAGUE), registry.versions.get(LEAGUE, 1)
-    version = publish_search(registry, base, league.config.environment, league.interface, "puct", 1000).number
-    patient = QUICK.model_copy(update={"timeout": 60.0, "run_timeout": 60.0})
-    with searching_replica(registry, monkeypatch, patient) as (client, handle), ThreadPoolExecutor(10) as requests:
+    server, handle = searching_server(registry, monkeypatch, PATIENT)
+    sizes, released, call = list[int](), asyncio.Event(), handle.call
+
+    async def hold(method: str, *arguments: Any) -> Any:
+        if method == "searches":
+            sizes.append(len(arguments[0]))
+            await released.wait()
+        return await call(method, *arguments)
+
+    with local_client(server) as client, ThreadPoolExecutor(10) as requests:
 
         def request(board: dict[str, list]) -> "Future[Response]":
-            return requests.submit(client.post, f"{PATH}?version={version}", json={"observation": board})
+            return requests.submit(client.post, f"{PATH}?version={SEARCH}", json={"observation": board})
 
         assert request(BOARDS[0]).result().status_code == 200
-        handle.calls.clear()
-        first = [request(BOARDS[0]) for _ in range(MESSAGES)]
-        until(lambda: handle.calls.count("searches") == MESSAGES)
-        replies = [reply.result().json() for reply in [*first, *(request(board) for board in 2 * BOARDS)]]
-    assert handle.calls.count("searches") < len(replies)
-    assert [reply["simulations"] for reply in replies] == [1000] * len(replies)
-    assert [reply["action"] for reply in replies[MESSAGES:-4]] == [reply["action"] for reply in replies[-4:]]
+        version = server.versions.cached(LEAGUE, SEARCH)
+        assert version is not None
+        search = version.policy(None).search
+        assert search is not None
+        monkeypatch.setattr(handle, "call", hold)
+        replies = [request(BOARDS[0]) for _ in range(MESSAGES)]
+        until(lambda: sizes == [1] * MESSAGES)
+        replies += [request(board) for board in 2 * BOARDS]
+        until(lambda: len(search._queue.waiting) == 2 * len(BOARDS))
+        assert client.portal is not None
+        client.portal.call(released.set)
+        answers = [reply.result().json() for reply in replies]
+    assert sizes == [*[1] * MESSAGES, 2 * len(BOARDS)]
+    assert [answer["simulations"] for answer in answers] == [50] * len(answers)
+    assert [answer["action"] for answer in answers[MESSAGES:-4]] == [answer["action"] for answer in answers[-4:]]
 
 
 def test_a_server_without_search_service_says_so(registry: Registry) -> None:

@@ -1,9 +1,9 @@
 """Content of checkpoints and requests is never executed: traps of each kind are served and sent, and none is triggered.
 
-CPython reports lookups of unpicklers and new processes to an audit hook (PEP 578). Meanwhile, nothing else in this
-process unpickles but Ray: what tasks of earlier tests return.
+CPython reports lookups of unpicklers and new processes to an audit hook (PEP 578).
 """
 
+import asyncio
 import base64
 import gzip
 import hashlib
@@ -13,12 +13,13 @@ import pickle
 import shutil
 import sys
 import tarfile
+import threading
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import onnx
@@ -39,21 +40,32 @@ from tests.support.waiting import until
 
 SUSPICIOUS = frozenset(("pickle.find_class", "os.system", "os.exec", "subprocess.Popen", "os.posix_spawn"))
 _watched: list[str] | None = None
+_threads: set[threading.Thread] = set()
+"""That of the test, those that it has started, and so on. Ray's and those of other replicas may unpickle."""
 
 
 def _hook(event: str, arguments: tuple[object, ...]) -> None:
-    if _watched is not None and event in SUSPICIOUS and not _is_by_ray():
+    if _watched is not None and event in SUSPICIOUS and threading.current_thread() in _threads:
         _watched.append(f"{event}{arguments}")
 
 
-def _is_by_ray() -> bool:
-    frame: FrameType | None = sys._getframe()
-    while frame is not None and frame.f_globals.get("__name__") != "ray._private.serialization":
-        frame = frame.f_back
-    return frame is not None
-
-
 sys.addaudithook(_hook)
+
+
+@pytest.fixture(autouse=True)
+def _followed_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Add the threads of the test to `_threads`. It comes before `client`, which starts the replica's."""
+    start = threading.Thread.start
+
+    def follow(thread: threading.Thread) -> None:
+        if threading.current_thread() in _threads:
+            _threads.add(thread)
+        start(thread)
+
+    _threads.add(threading.current_thread())
+    monkeypatch.setattr(threading.Thread, "start", follow)
+    yield
+    _threads.clear()
 
 
 @contextmanager
@@ -89,10 +101,13 @@ def trap(mark: Path) -> bytes:
     return pickle.dumps(Trap(mark))
 
 
-def test_loading_the_pickle_triggers_the_trap(trap: bytes, mark: Path) -> None:
-    with pytest.raises(AssertionError, match=r"pickle\.find_class"), nothing_executed():
-        pickle.loads(trap)
-    assert mark.exists()
+def test_loading_the_pickle_triggers_the_trap(client: TestClient, trap: bytes, mark: Path) -> None:
+    assert client.portal is not None
+    for load in (pickle.loads, partial(client.portal.call, asyncio.to_thread, pickle.loads)):  # a thread of the replica
+        with pytest.raises(AssertionError, match=r"pickle\.find_class"), nothing_executed():
+            load(trap)
+        assert mark.exists()
+        mark.unlink()
 
 
 def torch_checkpoint(trap: bytes) -> bytes:

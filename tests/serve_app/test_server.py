@@ -5,7 +5,7 @@ import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -71,22 +71,29 @@ def test_all_replicas_answer_with_their_name(url: str, served: Registry) -> None
 
 def test_replicas_have_the_priority_of_the_server(served: Registry) -> None:
     """Ray lowers that of its workers by default: busy processes of the machine would take the CPU from replicas."""
+    until(lambda: len(processes(served.storage, "PolicyServer")) == 2)  # one of them may be replaced
     replicas = processes(served.storage, "PolicyServer")
-    assert len(replicas) == 2
     own = os.getpriority(os.PRIO_PROCESS, 0)
     assert {os.getpriority(os.PRIO_PROCESS, pid) for pid in replicas} == {own}
 
 
 def test_all_processes_of_a_local_server_listen_on_loopback(served: Registry) -> None:
-    listeners = {
-        (process.name(), connection.laddr.ip)
-        for process in map(psutil.Process, processes(served.storage, ""))
-        for connection in process.net_connections("tcp")
-        if connection.status == psutil.CONN_LISTEN
-    }
-    addresses = {ip_address(address.removeprefix("::ffff:")) for _, address in listeners}
-    assert len({name for name, _ in listeners}) > 5, "of Ray, its agents, replicas and HAProxy"
-    assert [address for address in addresses if not address.is_loopback] == [], listeners
+    # Of Ray, its agents, replicas and HAProxy, which may be starting again.
+    until(lambda: len({name for name, _ in listeners(served.storage)}) > 5)
+    found = listeners(served.storage)
+    addresses = {ip_address(address.removeprefix("::ffff:")) for _, address in found}
+    assert [address for address in addresses if not address.is_loopback] == [], found
+
+
+def listeners(storage: Storage) -> set[tuple[str, str]]:
+    """Process and address of each socket of a server that listens."""
+    found = set()
+    for pid in processes(storage, ""):
+        with suppress(psutil.NoSuchProcess):
+            process = psutil.Process(pid)
+            sockets = process.net_connections("tcp")
+            found |= {(process.name(), one.laddr.ip) for one in sockets if one.status == psutil.CONN_LISTEN}
+    return found
 
 
 @pytest.mark.parametrize("method", ["ListApplications", "Healthz"])
@@ -98,24 +105,25 @@ def test_messages_to_ray_serve_itself_are_not_read(served: Registry, method: str
         ends.wait()
         yield b""
 
-    ports = set(
-        re.findall(rb"^ *server [^ ]* 127[.]0[.]0[.]1:(\d+) proto h2 check", haproxy_configuration(served), re.M)
-    )
-    assert len(ports) == 3
-    for port in ports:
-        with grpc.insecure_channel(f"127.0.0.1:{port.decode()}") as channel:
-            call = channel.stream_unary(f"/ray.serve.RayServeAPIService/{method}")
-            assert isinstance(call(never(), timeout=20), bytes)
-    ends.set()
+    until(lambda: len(grpc_ports(served)) == 3)
+    try:
+        for port in grpc_ports(served):
+            with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+                call = channel.stream_unary(f"/ray.serve.RayServeAPIService/{method}")
+                assert isinstance(call(never(), timeout=60), bytes)
+    finally:
+        ends.set()
 
 
-def haproxy_configuration(registry: Registry) -> bytes:
-    """The configuration of a server's HAProxy."""
-    for process in map(psutil.Process, processes(registry.storage, "haproxy")):
-        for argument in process.cmdline():
-            if argument.endswith("haproxy.cfg"):
-                return Path(argument).read_bytes()
-    raise AssertionError("no HAProxy runs")
+def grpc_ports(registry: Registry) -> set[str]:
+    """The ports in the configuration of a server's HAProxy; none while it is being replaced."""
+    for pid in processes(registry.storage, "haproxy.cfg"):
+        with suppress(psutil.NoSuchProcess, FileNotFoundError):
+            for argument in psutil.Process(pid).cmdline():
+                if argument.endswith("haproxy.cfg"):
+                    lines = Path(argument).read_text()
+                    return set(re.findall(r"^ *server [^ ]* 127[.]0[.]0[.]1:(\d+) proto h2 check", lines, re.M))
+    return set()
 
 
 def test_one_scrape_covers_all_replicas(url: str, served: Registry) -> None:
@@ -221,8 +229,9 @@ def test_promotions_under_load_lose_no_request(url: str, served: Registry) -> No
 @pytest.mark.parametrize("has_length", [True, False], ids=["content length", "chunked"])
 def test_a_body_of_a_hundred_megabytes_is_rejected(url: str, served: Registry, has_length: bool) -> None:
     size, part = 100 * 2**20, b" " * 2**16
+    until(lambda: len(peaks(served.storage)) == 2)
+    peaks_before = peaks(served.storage)
     headers = {"content-type": "application/json"} | ({"content-length": str(size)} if has_length else {})
-    memory_before = memory(served.storage)
     with httpx.Client(base_url=url) as client:
         try:
             reply = client.post(ACTION, content=(part for _ in range(size // len(part))), headers=headers)
@@ -230,16 +239,19 @@ def test_a_body_of_a_hundred_megabytes_is_rejected(url: str, served: Registry, h
             pytest.fail("the connection was cut before the answer could be read")
         assert (reply.status_code, reply.json()["code"]) == (413, "body_too_large")
         assert client.post(ACTION, json={"observation": BOARD}).status_code == 200
-    assert memory(served.storage) - memory_before < 20 * 2**20
+    growth = [peak - peaks_before[pid] for pid, peak in peaks(served.storage).items()]
+    # Half of a body: what the replica does besides, such as loading versions, takes less.
+    assert max(growth) < size / 2
 
 
-def memory(storage: Storage) -> int:
-    """The largest peak resident size of a replica, in bytes."""
-    peaks = []
+def peaks(storage: Storage) -> dict[int, int]:
+    """Process id of each replica → its peak resident size in bytes."""
+    found = {}
     for pid in processes(storage, "PolicyServer"):
-        status = Path(f"/proc/{pid}/status").read_text()
-        peaks += [int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM")]
-    return max(peaks)
+        with suppress(FileNotFoundError):
+            (peak,) = re.findall(r"^VmHWM:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.M)
+            found[pid] = int(peak) * 1024
+    return found
 
 
 @pytest.mark.slow
@@ -248,7 +260,7 @@ def test_our_client_survives_the_death_of_a_replica(url: str, served: Registry) 
     victim = processes(served.storage, "PolicyServer")[0]
 
     def caller() -> Callable[[], int]:
-        client = Client(url)
+        client = Client(url, retry_deadline=60.0)  # a busy machine may replace a replica slowly
         return lambda: client.act("board", BOARD).version
 
     with load(caller, callers=8) as result:
@@ -350,8 +362,9 @@ def test_a_tampered_champion_never_answers(url: str, served: Registry) -> None:
 def evaluator(url: str, served: Registry) -> Iterator[httpx.Client]:
     """A client with a key that may play and start evaluations and nightly runs."""
     _, token = served.keys.create("night-owl", ["act", "read", "evaluate", "promote"])
+    promote(served, "board", 1)
+    served.changes.wait_for_alias(served.aliases.history("board")[0], 60)  # both replicas know the key, too
     with httpx.Client(base_url=url, headers={"x-api-key": token}, timeout=30) as client:
-        until(lambda: client.delete(f"{EVALUATIONS}/99").status_code == 404)  # both replicas know the key
         yield client
 
 
@@ -394,7 +407,7 @@ def test_a_killed_evaluation_continues_and_equals_league_evaluate(
 
     path = start(evaluator, blocks=150)
     until(lambda: Ledger(served).positions(report.schedule) if is_stored(served, report.schedule) else False)
-    (first,) = processes(served.storage, "evaluation.service.evaluation_job")
+    first = only_process(served.storage, "evaluation.service.evaluation_job")
     os.kill(first, signal.SIGKILL)
     left = stored_matches()
     assert 0 < len(left) < len(matches)
@@ -483,21 +496,25 @@ def test_a_game_survives_the_death_of_any_process(evaluator: httpx.Client, serve
         return dict(retry_until_ready(lambda: evaluator.post("/v1/leagues/tictactoe/play", json=body)).json())
 
     body["actions"].append(move()["legal"][0])
-    (worker,) = processes(served.storage, "evaluation.service.game_worker")
+    worker = only_process(served.storage, "evaluation.service.game_worker")
     os.kill(worker, signal.SIGKILL)
     until(lambda: worker not in processes(served.storage, "evaluation.service.game_worker"))
     body["actions"].append(move()["legal"][0])
-    (service,) = processes(served.storage, ":EvaluationService")
+    service = only_process(served.storage, ":EvaluationService")
     os.kill(service, signal.SIGKILL)
     document = move()
     assert [each["moves"][0]["action"] for each in document["steps"][1::2]] == body["actions"]
     until(lambda: service not in processes(served.storage, ":EvaluationService"))
-    assert len(processes(served.storage, "evaluation.service.game_worker")) == 1, (
-        "the worker of the killed evaluation service has ended"
-    )
+    only_process(served.storage, "evaluation.service.game_worker")  # that of the killed service ends
     rejected = evaluator.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
     assert (rejected.status_code, rejected.json()["code"]) == (422, "illegal_action")
     assert "Traceback" not in rejected.text
+
+
+def only_process(storage: Storage, name: str) -> int:
+    """The only process of this name, once another one has ended."""
+    until(lambda: len(processes(storage, name)) == 1)
+    return processes(storage, name)[0]
 
 
 @pytest.mark.slow
@@ -535,5 +552,8 @@ def test_a_killed_server_can_be_restarted(storage: Storage) -> None:
 
 def launcher(port: int) -> int:
     """The process that `running` started to serve on a port."""
-    children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
-    return next(int(pid) for pid in children if f'"port": {port}' in Path(f"/proc/{pid}/cmdline").read_text())
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):
+            if any(f'"port": {port}' in argument for argument in child.cmdline()):
+                return child.pid
+    raise AssertionError(f"no process serves on port {port}")

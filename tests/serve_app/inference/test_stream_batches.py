@@ -8,40 +8,38 @@ import numpy as np
 import pytest
 
 from league.errors import GraphTimeout, ObservationError
-from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.app import Replica
 from serve_app.inference.action_request import Arrays
 from serve_app.inference.stream_batches import StreamBatches
-from serve_app.live_versions.version_cache import LoadedPolicy
+from serve_app.live_versions import version_cache
+from serve_app.live_versions.version_cache import ActionSelections, LoadedPolicy
 from tests.support.clients.actions import BOARD, boards
-from tests.support.servers.replicas import QUICK, UnavailableEvaluation, local_client
 
 
 @pytest.fixture
 def policy(storage: Storage) -> Iterator[LoadedPolicy]:
     """A policy of its own: a run that is too slow changes it."""
-    server = Replica(Registry.open(storage), QUICK, "replica-1", evaluation_client=UnavailableEvaluation())
-    with local_client(server):
-        loaded = server.models.find_loaded("board", "champion", [])
-        assert loaded is not None
-        loaded[1].inline_rows = 64  # however fast the machine is
-        yield loaded[1]
+    registry = Registry.open(storage)
+    policy = version_cache.load(registry, "board", 1, 0.0, ActionSelections()).policy("shared")
+    policy.inline_rows = 64  # however fast the machine is
+    policy.inline_policy = policy.policy.within(60.0)
+    yield policy
+    registry.close()
 
 
 @pytest.fixture
-def batches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The number of rows of each run."""
+def batches(policy: LoadedPolicy, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The number of rows of each of its runs."""
     rows = list[int]()
-    act = OnnxPolicy.act
+    act = policy.inline_policy.act
 
-    def counted(policy: OnnxPolicy, observations: Arrays, **options: Any) -> Actions:
+    def counted(observations: Arrays, **options: Any) -> Actions:
         rows.append(len(observations["action_mask"]))
-        return act(policy, observations, **options)
+        return act(observations, **options)
 
-    monkeypatch.setattr(OnnxPolicy, "act", counted)
+    monkeypatch.setattr(policy.inline_policy, "act", counted)
     return rows
 
 
@@ -109,6 +107,6 @@ def test_messages_of_a_slow_policy_run_in_threads(policy: LoadedPolicy, monkeypa
         monkeypatch.undo()
         raise GraphTimeout("too slow")
 
-    monkeypatch.setattr(OnnxPolicy, "act", run_out_of_time)
+    monkeypatch.setattr(policy.inline_policy, "act", run_out_of_time)
     assert asyncio.run(together(policy, [arrays([BOARD])] * 100)) == ["awaits a thread"] * 100, "of later batches, too"
     assert policy.inline_rows == 0

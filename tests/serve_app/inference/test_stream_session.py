@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from league.settings import Storage
+from serve_app.access import api_keys
+from serve_app.access.api_keys import TokenBucket
 from serve_app.app import Replica
 from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, encode_request
 from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards
@@ -410,15 +413,17 @@ def test_revoking_a_key_ends_its_streams(client: TestClient, registry: Registry)
         assert (close.code, "bot was revoked" in close.reason) == (1008, True)
 
 
-def test_the_first_key_ends_an_idle_stream_without_one(client: TestClient, registry: Registry) -> None:
-    with open_stream(client) as stream:
+def test_the_first_key_ends_an_idle_stream_without_one(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("serve_app.routes.stream.KEY_CHECK_INTERVAL", 0.1)
+    with replica(registry.storage) as client, open_stream(client) as stream:
         registry.keys.create("bot", ["act"])
         with pytest.raises(WebSocketDisconnect) as caught:
             stream.receive_json()
         assert (caught.value.code, caught.value.reason) == (1008, "this stream now requires an API key")
 
 
-def test_each_message_counts_for_the_rate_limit_of_a_key(registry: Registry) -> None:
+def test_each_message_counts_for_the_rate_limit_of_a_key(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api_keys, "TokenBucket", partial(TokenBucket, clock=lambda: 0.0))  # no time passes
     _, token = registry.keys.create("slow", ["act"], rate=0.5)
     with replica(registry.storage) as client, open_stream(client, authorization=f"Bearer {token}") as stream:
         error = send(stream, BODY)

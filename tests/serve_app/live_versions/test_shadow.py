@@ -28,7 +28,9 @@ FULL = BOARD | {"observation": np.ones((6, 7, 2), int).tolist()}
 
 @pytest.fixture
 def server(registry: Registry) -> Replica:
-    return Replica(Registry.open(registry.storage), QUICK, "replica-1")
+    # Otherwise the shadow pauses for nine times as long as a run that does not end.
+    settings = QUICK.model_copy(update={"shadow_load": 0.5})
+    return Replica(Registry.open(registry.storage), settings, "replica-1")
 
 
 @pytest.fixture
@@ -107,14 +109,27 @@ def test_a_failing_candidate_is_counted_and_does_not_affect_requests(
     assert (found.requests, found.agreed) == (0, 0)
 
 
-def test_a_run_that_does_not_end_is_counted(client: TestClient, registry: Registry) -> None:
+def shadow_policy(server: Replica, version: int) -> OnnxPolicy:
+    """The policy of a version of `board` with which a shadow runs."""
+    candidate = server.versions.cached("board", version)
+    assert candidate is not None
+    policy = candidate.policies["shared"].shadow_policy
+    assert isinstance(policy, OnnxPolicy)
+    return policy
+
+
+def test_a_run_that_does_not_end_is_counted(
+    client: TestClient, server: Replica, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Those that wait for the same version are counted without being run."""
+    monkeypatch.setattr("serve_app.live_versions.version_cache.SHADOW_TIMEOUT", 0.1)
     endless = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
     set_shadow(registry, version=endless)
     for _ in range(20):
         assert act(client, observation=FULL)["version"] == 1
     found = wait_for(registry, lambda one: one.failed == 20, candidate=endless)
     assert found.requests == 0
+    monkeypatch.setattr(shadow_policy(server, endless), "_timeout", 60.0)  # a busy machine may need more than 0.1 s
     act(client, observation=BOARD)
     wait_for(registry, lambda one: one.requests == 1, candidate=endless)
 
@@ -125,10 +140,16 @@ def test_runs_end_when_the_shadow_is_switched_off(
     monkeypatch.setattr("serve_app.live_versions.version_cache.SHADOW_TIMEOUT", 600.0)
     endless = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
     set_shadow(registry, version=endless)
+    owner = shadow_policy(server, endless)._owner
+    assert owner is not None
+
+    def runs() -> int:
+        return sum(run.owner is owner for run in tuple(graph_runs._runs))
+
     act(client, observation=FULL)
-    until(lambda: len(graph_runs._runs) == 1)
+    until(lambda: runs() == 1)
     registry.traffic.set("board", shadow=None, actor="test", reason="test")
-    until(lambda: not graph_runs._runs)
+    until(lambda: runs() == 0)
     wait_for(registry, lambda one: one.failed == 1, candidate=endless)
 
 
@@ -138,6 +159,12 @@ async def replica_with_shadow(registry: Registry) -> tuple[Replica, Shadow]:
     server.alias_slots.update({("board", "champion"): 1, ("board", "2"): 2})
     await server.alias_slots.settle(30)
     return server, server.shadow
+
+
+async def wait_for_requests(shadow: Shadow, number: int) -> None:
+    async with asyncio.timeout(60):
+        while shadow.shadowings()[0].requests < number:
+            await asyncio.sleep(0.001)
 
 
 @pytest.mark.anyio
@@ -151,13 +178,9 @@ async def test_requests_beyond_the_queue_limit_are_dropped(registry: Registry) -
     for _ in range(10):
         mirror(observations, None, np.array([0]))
     assert [one.dropped for one in shadow.shadowings()] == [6]
-    async with asyncio.timeout(10):
-        while shadow.shadowings()[0].requests < 4:
-            await asyncio.sleep(0.001)
+    await wait_for_requests(shadow, 4)
     mirror(observations, None, np.array([0]))
-    async with asyncio.timeout(10):
-        while shadow.shadowings()[0].requests < 5:
-            await asyncio.sleep(0.001)
+    await wait_for_requests(shadow, 5)
     server.shadow.close()
 
 

@@ -3,13 +3,11 @@
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
-from typing import Any
 
 import httpx
 import pytest
 from jsonschema import Draft202012Validator
 
-from league.registry.changes import ChangeRepository
 from league.registry.registry import Registry
 from league.registry.storage.rows import ChangeToken, EvaluationRow
 from serve_app.app import Replica
@@ -87,17 +85,18 @@ def test_all_listeners_share_a_poll_and_there_is_none_without_listeners(
     server: Listening, registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     polls: list[str] = []
-    token = ChangeRepository.token
+    changes = server.server.registry.changes
+    token = changes.token
 
-    def count_polls(self: ChangeRepository, league: str, **options: Any) -> ChangeToken:
+    def count_polls(league: str) -> ChangeToken:
         polls.append(league)
-        return token(self, league, **options)
+        return token(league)
 
     def wait_for_polls(league: str, times: int) -> None:
         polls.clear()
         until(lambda: polls.count(league) >= times)
 
-    monkeypatch.setattr(ChangeRepository, "token", count_polls)
+    monkeypatch.setattr(changes, "token", count_polls)
     with listen(server, "/v1/leagues/memory/events"):
         with ExitStack() as stack:
             listeners = [stack.enter_context(listen(server)) for _ in range(5)]
@@ -146,21 +145,16 @@ def test_the_number_of_listeners_is_limited(registry: Registry) -> None:
             assert stream.reply.status_code == 200
 
 
-@pytest.mark.parametrize(
-    ("path", "status", "code"),
-    [
+def test_an_unknown_resource_is_reported_before_a_stream_starts(server: Listening) -> None:
+    for path, status, code in (
         ("/v1/leagues/nobody/events", 404, "unknown_league"),
         ("/v1/leagues/NO/events", 400, "invalid_reference"),
         ("/v1/leagues/board/evaluations/7/events", 404, "unknown_evaluation"),
         ("/v1/leagues/board/evaluations/x/events", 404, "unknown_evaluation"),
-    ],
-)
-def test_an_unknown_resource_is_reported_before_a_stream_starts(
-    server: Listening, path: str, status: int, code: str
-) -> None:
-    reply = httpx.get(f"{server.url}{path}")
-    assert (reply.status_code, reply.json()["code"]) == (status, code)
-    assert server.server.events.connections.open == 0
+    ):
+        reply = httpx.get(f"{server.url}{path}")
+        assert (reply.status_code, reply.json()["code"]) == (status, code), path
+        assert server.server.events.connections.open == 0
 
 
 def test_a_head_request_is_answered_at_once(server: Listening) -> None:
@@ -168,15 +162,15 @@ def test_a_head_request_is_answered_at_once(server: Listening) -> None:
     assert (reply.status_code, reply.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
 
 
-def test_the_timeout_of_requests_does_not_apply_to_streams(registry: Registry) -> None:
-    with (
-        listening(registry.storage, SOON.model_copy(update={"timeout": 1.5})) as server,
-        listen(server, **{"x-request-timeout-ms": "1"}) as stream,
-    ):
+def test_the_timeout_of_requests_does_not_apply_to_streams(
+    server: Listening, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(events, "KEEPALIVE_INTERVAL", 0.05)
+    with listen(server, **{"x-request-timeout-ms": "1"}) as stream:
         for version in (2, 3, 1):
             promote(registry, "board", version)
             until(lambda version=version: stream.last["aliases"] == {"champion": version})
-        until(lambda: stream.lines.count(": keep-alive") > 0)
+        until(lambda: stream.lines.count(": keep-alive") > 3)
         assert not stream.is_over
 
 
@@ -196,12 +190,12 @@ def test_a_stopping_replica_rejects_new_streams(server: Listening) -> None:
 
 def test_a_registry_that_does_not_respond_times_out(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = threading.Event()
-    monkeypatch.setattr(ChangeRepository, "token", lambda *_, **__: answer.wait(20))
     with listening(registry.storage, SOON.model_copy(update={"timeout": 0.05})) as server:
-        reply = httpx.get(f"{server.url}{LEAGUE}")
+        monkeypatch.setattr(server.server.registry.changes, "token", lambda _: answer.wait(60))
+        reply = httpx.get(f"{server.url}{LEAGUE}", timeout=60)
         answer.set()
         assert (reply.status_code, reply.json()["code"]) == (504, "deadline_exceeded")
-        assert server.server.events.connections.open == 0
+        until(lambda: server.server.events.connections.open == 0)
 
 
 def test_a_stream_ends_with_its_key(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import socket
 import struct
 from collections import Counter
@@ -19,6 +20,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.access import access_control
 from serve_app.access.api_keys import ApiKey
+from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.inference.stream_codec import RESPONSE, encode_request
 from serve_app.runtime import uvicorn_websocket
 from tests.support.clients.actions import BOARD, boards
@@ -141,7 +143,7 @@ def test_a_fragmented_message_is_one_message(listener: Listening) -> None:
 
 def test_pings_are_answered_between_fragments(listener: Listening) -> None:
     with open_stream(listener) as stream:
-        assert stream.ping().wait(20)
+        assert stream.ping().wait(DEADLINE)
 
         def parts() -> Iterator[str]:
             for at in range(0, len(BODY), 100):
@@ -150,7 +152,7 @@ def test_pings_are_answered_between_fragments(listener: Listening) -> None:
 
         stream.send(parts())
         assert receive(stream)["version"] == 1
-        assert stream.ping().wait(20)
+        assert stream.ping().wait(DEADLINE)
         assert answer_to(stream, BODY)["version"] == 1
 
 
@@ -191,7 +193,7 @@ class RawClient:
     def flood(self, message: bytes) -> int:
         """Send a message repeatedly without reading, until no more is accepted; returns the number of bytes."""
         sent = 0
-        self.socket.settimeout(1)
+        self.socket.settimeout(0.3)
         with suppress(TimeoutError):
             while True:
                 assert sent < 200 * 2**20, "the server does not stop reading"
@@ -206,6 +208,12 @@ class RawClient:
         assert self.file.read() == b""
         self.socket.close()
         return int.from_bytes(payload[:2], "big")
+
+
+def shrink_send_buffers(listener: Listening) -> None:
+    """Of connections that the server accepts from now on: they are full after some answers."""
+    with socket.socket(fileno=os.dup(listener.uvicorn.servers[0].sockets[0].fileno())) as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 16384)
 
 
 def frame(payload: bytes, first: int = 0x81, mask: bytes = b"\1\2\3\4") -> bytes:
@@ -401,6 +409,7 @@ def test_all_encodings_of_the_length(listener: Listening, size: int) -> None:
 
 def test_the_server_stops_reading_from_a_client_that_does_not_read(listener: Listening) -> None:
     """Other clients are answered in the meantime, and this one as soon as it reads."""
+    shrink_send_buffers(listener)
     raw = RawClient(listener)
     sent = raw.flood(INVALID_MESSAGE)
     with open_stream(listener) as stream:
@@ -418,7 +427,7 @@ def test_a_slow_graph_is_awaited(storage: Storage) -> None:
         for _ in range(40):
             stream.send(ONE)
         assert [receive(stream)["action"] for _ in range(40)] == [0, 0] + [1] * 38
-        assert stream.ping().wait(20)
+        assert stream.ping().wait(DEADLINE)
 
 
 def test_a_revoked_key_ends_the_stream(registry: Registry) -> None:
@@ -437,8 +446,9 @@ def test_a_revoked_key_ends_the_stream(registry: Registry) -> None:
 
 
 @pytest.mark.parametrize("name", ["bot", "b" * 100])
-def test_a_revoked_key_ends_an_idle_stream(registry: Registry, name: str) -> None:
+def test_a_revoked_key_ends_an_idle_stream(registry: Registry, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """The reason of a close frame is limited to 123 bytes, and the name of a key to 100."""
+    monkeypatch.setattr("serve_app.routes.stream.KEY_CHECK_INTERVAL", 0.1)
     _, token = registry.keys.create(name, ["act"])
     with (
         listening(registry.storage) as listener,
@@ -446,7 +456,7 @@ def test_a_revoked_key_ends_an_idle_stream(registry: Registry, name: str) -> Non
     ):
         registry.keys.revoke(name)
         with pytest.raises(ConnectionClosed) as caught:
-            stream.recv(timeout=60)
+            stream.recv(DEADLINE)
         assert caught.value.rcvd is not None
         assert (caught.value.rcvd.code, f"{name} was" in caught.value.rcvd.reason) == (1008, True)
         until(lambda: listener.server.stream.connections.open == 0)
@@ -481,12 +491,14 @@ def test_a_client_that_neither_reads_nor_closes_does_not_block_stopping(
 ) -> None:
     monkeypatch.setattr(uvicorn_websocket, "CLOSE_TIMEOUT", 0.2)
     with listening(storage) as listener:
+        shrink_send_buffers(listener)
         raw = RawClient(listener)
         raw.flood(INVALID_MESSAGE)
     raw.socket.close()
 
 
-def test_a_client_that_does_not_respond_is_disconnected(storage: Storage) -> None:
+def test_a_client_that_does_not_respond_is_disconnected(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uvicorn_websocket, "CLOSE_TIMEOUT", 0.2)
     with listening(storage, ws_ping_interval=0.1, ws_ping_timeout=0.1) as listener:
         raw = RawClient(listener)
         assert raw.frame()[0] == 0x80 | Opcode.PING
@@ -496,7 +508,9 @@ def test_a_client_that_does_not_respond_is_disconnected(storage: Storage) -> Non
         until(lambda: listener.server.stream.connections.open == 0)
 
 
-def test_broken_connections_are_removed(listener: Listening) -> None:
+def test_broken_connections_are_removed(listener: Listening, monkeypatch: pytest.MonkeyPatch) -> None:
+    connections = ConnectionLimit("streams", 3, 3)  # without those of other tests, which may not have ended yet
+    monkeypatch.setattr(listener.server.stream, "connections", connections)
     for sent in (b"", frame(BODY.encode()), frame(BODY.encode())[:50]):
         raw = RawClient(listener)
         raw.socket.sendall(sent)
@@ -504,4 +518,4 @@ def test_broken_connections_are_removed(listener: Listening) -> None:
         raw.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         raw.file.close()
         raw.socket.close()
-    until(lambda: listener.server.stream.connections.open == 0)
+    until(lambda: connections.open == 0)
