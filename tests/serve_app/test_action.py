@@ -12,7 +12,7 @@ from urllib.parse import quote
 import httpx
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
@@ -21,6 +21,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
 from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards, rejected
+from tests.support.examples import examples
 from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.replicas import LOCALHOST, QUICK, READ_ONLY
 from tests.support.waiting import until
@@ -346,7 +347,7 @@ near_misses = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=400, deadline=None)
+@examples(400)
 @given(
     body=st.binary(max_size=60) | near_misses.map(lambda body: json.dumps(body).encode()),
     model=st.sampled_from(["board", "vector", "nested", "memory", "duo", "duo.left"]) | st.text(max_size=10),

@@ -26,6 +26,7 @@ from serve_app.inference_protocol.inference import InferResponse
 from serve_app.inference_protocol.rest_codec import read_request, write_response
 from serve_app.inference_protocol.tensors import read_inputs, signature_of
 from serve_app.live_versions.version_cache import ActionSelections, LoadedPolicy, load
+from tests.support.examples import examples
 from tests.support.generated_requests import OPERATIONS, draw_request
 from tests.support.leagues.match_results import record
 from tests.support.leagues.protocol_leagues import every_kind
@@ -41,7 +42,7 @@ CONFORMS = CHECKS.get_by_names(
         "response_schema_conformance",
     ]
 )
-SEVERAL = {"deadline": None, "suppress_health_check": list(HealthCheck)}
+SEVERAL: dict[str, Any] = {"suppress_health_check": list(HealthCheck)}
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def fuzzed(storage_to_fuzz: Storage) -> Iterator[TestClient]:
 
 
 @pytest.mark.parametrize("operation", OPERATIONS, ids=lambda each: each.label.replace("/", " "))
-@settings(max_examples=8, **SEVERAL)
+@settings(examples(8), **SEVERAL)
 @given(data=st.data())
 def test_each_response_is_documented(fuzzed: TestClient, operation: APIOperation, data: st.DataObject) -> None:
     drawn = draw_request(data, operation)
@@ -117,7 +118,7 @@ def is_client_error(error: LeagueError) -> bool:
     return status_of(error) < 500 and 0 < len(str(error)) < 2000
 
 
-@settings(max_examples=400, **SEVERAL)
+@settings(examples(400), **SEVERAL)
 @given(data=st.data())
 def test_a_binary_message_of_a_stream_is_parsed_or_rejected(
     policies: dict[str, LoadedPolicy], data: st.DataObject
@@ -140,7 +141,7 @@ def test_a_binary_message_of_a_stream_is_parsed_or_rejected(
     assert len(framing.write(answer.actions, 1)) == 16 + answer.actions.nbytes
 
 
-@settings(max_examples=400, **SEVERAL)
+@settings(examples(400), **SEVERAL)
 @given(data=st.data())
 def test_a_binary_inference_is_parsed_or_rejected(policies: dict[str, LoadedPolicy], data: st.DataObject) -> None:
     policy = policies[data.draw(st.sampled_from(MODELS))]
@@ -174,7 +175,7 @@ def binary_inference(policy: LoadedPolicy, rows: int, data: st.DataObject) -> tu
     return b"".join((head, *parts)), len(head)
 
 
-@settings(max_examples=150, **SEVERAL)
+@settings(examples(150), **SEVERAL)
 @given(data=st.data())
 def test_a_binary_inference_over_http_is_answered_or_rejected(
     fuzzed: TestClient, policies: dict[str, LoadedPolicy], data: st.DataObject
@@ -197,7 +198,7 @@ def test_a_stream_survives_any_messages(fuzzed: TestClient, policies: dict[str, 
 
     with fuzzed.websocket_connect("/v1/policies/memory/stream") as stream:
 
-        @settings(max_examples=300, **SEVERAL)
+        @settings(examples(300), **SEVERAL)
         @given(
             message=damaged(valid) | st.binary(max_size=40) | damaged(b'{"observation": [1], "reset": true}').map(_text)
         )

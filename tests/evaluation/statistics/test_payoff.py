@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -9,6 +9,7 @@ from evaluation.statistics.population import resampled_interval, resampled_score
 from league.results.equilibria import alpha_rank, nash_averaging
 from league.results.sums import tally
 from tests.support.closeness import close
+from tests.support.examples import examples
 from tests.support.leagues.payoff_matches import match
 
 SIDES = ("first", "second")
@@ -52,7 +53,7 @@ def test_values_equal_those_of_open_spiel_and_nash_averaging() -> None:
     assert alpha_rank((TRANSITIVE + 1) / 2) == pytest.approx([0, 0, 1], abs=1e-4)
 
 
-@settings(deadline=None, max_examples=200)
+@examples(200)
 @given(games())
 def test_no_strategy_gains_against_the_equilibrium(payoff: np.ndarray) -> None:
     share, value = nash_averaging(payoff)
@@ -62,7 +63,7 @@ def test_no_strategy_gains_against_the_equilibrium(payoff: np.ndarray) -> None:
     assert value[share > 1e-6] == pytest.approx(0, abs=1e-5)
 
 
-@settings(deadline=None, max_examples=100)
+@examples(100)
 @given(games(), st.data())
 def test_copies_divide_the_share_of_the_original(payoff: np.ndarray, data: st.DataObject) -> None:
     """Nash averaging is invariant to redundancy: copies divide a share, and the other shares do not change."""
@@ -92,7 +93,7 @@ def test_of_several_equilibria_the_one_of_maximum_entropy_is_chosen() -> None:
     assert share == pytest.approx([0.25] * 4)
 
 
-@settings(deadline=None, max_examples=100)
+@examples(100)
 @given(games())
 def test_alpha_rank_is_stationary_and_favours_undefeated_strategies(payoff: np.ndarray) -> None:
     rank = alpha_rank((payoff + 1) / 2)

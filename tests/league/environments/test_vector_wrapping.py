@@ -15,6 +15,7 @@ from league.environments.vector.vector_env import VectorEnv
 from tests.support.environments.flicker import flicker
 from tests.support.environments.mutants import Mutation, mutated
 from tests.support.environments.plans import Plan, assert_equal, plans
+from tests.support.examples import examples
 
 SPREAD, TAG, REFERENCE = "mpe2.simple_spread_v3", "mpe2.simple_tag_v3", "mpe2.simple_reference_v3"
 PAD, INDICATOR = "pad_observations_v0", "agent_indicator_v0"
@@ -75,7 +76,7 @@ def test_all_reports_equal_those_of_the_stock_environment(plan: Plan, wrapped: W
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning", "ignore::RuntimeWarning")
-@settings(max_examples=250)
+@examples(250)
 @given(plans, environments)
 def test_many_combinations_equal_the_stock_environment(plan: Plan, wrapped: Wrapped) -> None:
     check(plan, wrapped)

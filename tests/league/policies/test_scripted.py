@@ -23,6 +23,7 @@ from tests.support.environments.line_games import (
     random_moves,
     spaces,
 )
+from tests.support.examples import examples
 
 DRAWS = 150
 """Enough draws for nine equally likely actions: the probability that one is missing is below 1e-6."""
@@ -51,7 +52,7 @@ def chosen_actions(policy: Policy, env: Any) -> set[int]:
     return set(policy.act(observations([env] * DRAWS), rng=generators(DRAWS)).actions.tolist())
 
 
-@settings(max_examples=120, deadline=None)
+@examples(120)
 @given(st.sampled_from(sorted(GAMES)), st.integers(0, 10_000), st.integers(0, 41))
 def test_one_ply_wins_or_blocks_or_plays_any_legal_move(game: str, seed: int, plies: int) -> None:
     moves = random_moves(game, seed, plies)

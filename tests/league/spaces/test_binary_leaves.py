@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from PIL import PngImagePlugin
 from league.errors import BodyTooLarge, ObservationError
 from league.spaces import Box, Leaf
 from league.spaces.binary_leaves import MAX_DECODED_BYTES, SIGNATURE, check_decoded_size, decode, is_encoded
+from tests.support.examples import examples
 from tests.support.pictures import MODES, png
 
 DTYPES = (
@@ -213,7 +214,7 @@ def test_the_decoded_size_of_images_is_limited() -> None:
         check_decoded_size("observation", [*rows, [0]], large)
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(
     image=st.sampled_from([GOOD, png(np.zeros((3, 4, 4), np.uint8), compress_level=0)]),
     at=st.integers(0, 200),
@@ -231,7 +232,7 @@ def test_a_damaged_image_is_rejected_or_has_its_shape(image: bytes, at: int, put
         assert (read.shape, read.dtype) == (shape, np.uint8)
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(
     chunks=st.lists(st.tuples(st.sampled_from([b"IHDR", b"IDAT", b"IEND", b"PLTE", b"tEXt"]), st.binary(max_size=30)))
 )

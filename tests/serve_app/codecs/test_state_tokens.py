@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from league.errors import InvalidState
 from league.refs import MAX_VERSION
 from league.spaces import Box, Leaf
 from serve_app.codecs.state_tokens import StateToken, common_version, read_state, read_token, write_tokens
+from tests.support.examples import examples
 
 MODEL, SHA256 = "memory.shared", "ab" * 32
 LEAVES: list[tuple[str, Leaf]] = [
@@ -82,7 +83,7 @@ def test_a_token_must_be_a_string(value: Any) -> None:
         read_token(value)
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(at=st.integers(0, 500), put=st.text(max_size=3), cut=st.integers(0, 3))
 def test_a_damaged_token_is_rejected(at: int, put: str, cut: int) -> None:
     valid = token()
@@ -97,7 +98,7 @@ def test_a_damaged_token_is_rejected(at: int, put: str, cut: int) -> None:
     assert read == read_token(valid)
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(text=st.text(alphabet="ABCXYZabcxyz0189-_", max_size=120) | st.text(max_size=60))
 def test_any_text_is_rejected_cleanly(text: str) -> None:
     with pytest.raises(InvalidState):

@@ -11,7 +11,7 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from league.registry.registry import Registry
@@ -22,6 +22,7 @@ from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.grpc_service import CONTENTS
 from serve_app.runtime.timeouts import run_within
 from tests.support.clients.protocol_observations import observations, policy_of
+from tests.support.examples import examples
 from tests.support.leagues.protocol_leagues import DTYPES
 from tests.support.servers.protocol_servers import SETTINGS, InProcess, Listening
 from tests.support.waiting import until
@@ -268,7 +269,7 @@ requests = st.builds(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@examples(300)
 @given(request=requests | st.binary(max_size=60))
 def test_no_message_causes_a_server_error(call: Call, request: Any) -> None:
     failure = None

@@ -11,13 +11,14 @@ import httpx
 import jsonschema
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
 from league.errors import StorageError
 from league.registry.versions import VersionRepository
 from league.settings import Storage
+from tests.support.examples import examples
 from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.protocol_servers import SETTINGS
 from tests.support.servers.replicas import QUICK
@@ -458,7 +459,7 @@ VALID = {
 }
 
 
-@settings(max_examples=400, deadline=None)
+@examples(400)
 @given(
     document=documents | st.just(VALID),
     rest=st.binary(max_size=100) | st.just(bytes(84) + b"\1" * 7),
@@ -488,7 +489,7 @@ def test_no_request_causes_a_server_error(
         error_of(reply, reply.status_code)
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(body=st.binary(max_size=200), length=st.none() | st.integers(0, 220))
 def test_no_body_causes_a_server_error(client: TestClient, body: bytes, length: int | None) -> None:
     reply = infer(client, body, **({} if length is None else {LENGTH: str(length)}))

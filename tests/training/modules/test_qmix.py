@@ -7,13 +7,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from ray.rllib.core.columns import Columns
 
 from league.interface import AgentInterface
 from league.policies.onnx import OnnxPolicy
 from league.spaces.conversion import from_gymnasium
+from tests.support.examples import examples
 from training.export.onnx_export import export_policy
 from training.modules.policy_module import MASKED_LOGIT, PREVIOUS_ACTION
 from training.modules.qmix import AgentNetwork, MonotonicMixer, independent_mixer, vdn_mixer
@@ -144,7 +145,7 @@ def test_a_graph_starts_like_its_module_and_remembers_drawn_actions(tmp_path: Pa
     seed=st.integers(0, 2**31),
     data=st.data(),
 )
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_the_mixer_is_monotonic(
     agents: int, size: int, width: int, scale: float, seed: int, data: st.DataObject
 ) -> None:

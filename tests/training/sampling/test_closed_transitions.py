@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pettingzoo import ParallelEnv
 
@@ -18,6 +18,7 @@ from league.environments.lockstep import stock_stepping
 from league.errors import EnvironmentMismatch
 from league.random.seeds import generator
 from tests.support.environments.scripted_environment import AgentRecord, Scripted, interface
+from tests.support.examples import examples
 from tests.support.leagues.training_leagues import tictactoe
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
 from training.replay_buffer import NEXT, TransitionBlock
@@ -60,7 +61,7 @@ def expected_rows(seed: int, agent: int, record: AgentRecord) -> list[tuple[obje
     opponents=st.sampled_from([[], [RANDOM]]),
     fragment_lengths=FRAGMENT_LENGTHS,
 )
-@settings(deadline=None, max_examples=100)
+@examples(100)
 def test_each_transition_is_recorded_once_with_its_successor(
     agents: int,
     num_envs: int,

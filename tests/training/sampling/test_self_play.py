@@ -17,6 +17,7 @@ from league.policies.actions import to_environment
 from league.random.seeds import generator
 from league.results.records import Scoring
 from tests.support.environments.scripted_environment import AgentRecord, EpisodeRecord, Scripted, interface
+from tests.support.examples import examples
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
 from training.sampling.episode_chunks import as_episodes
 from training.sampling.opponents import OpponentPolicy
@@ -123,7 +124,7 @@ def check_outputs(chunk: SingleAgentEpisode, steps_before: int) -> None:
     opponents=st.sampled_from([[], [RANDOM]]),
     fragment_lengths=FRAGMENT_LENGTHS,
 )
-@settings(deadline=None, max_examples=150)
+@examples(150)
 def test_each_step_of_a_policy_is_recorded_once(
     agents: int,
     num_envs: int,

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from mpe2._mpe_utils import core
 
 from league.environments.vector.mpe.particles import Particles, Physics, World, at_rest, lengths
+from tests.support.examples import examples
 
 SIZES = (0.15, 0.05, 0.2)
 COORDINATES = st.floats(-0.5, 0.5)
@@ -32,7 +33,7 @@ def bits(array: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(array), np.nan, array).view(np.uint64)
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(
     st.lists(st.tuples(POINTS, POINTS, POINTS, POINTS, POINTS, POINTS), min_size=1, max_size=4),
     st.sampled_from([SIZES, SIZES[:2], ()]),
