@@ -105,6 +105,13 @@ def unsynced() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def short_examinations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`check-env` compares 20,000 steps with the stock environment, and measures the speed for a second."""
+    monkeypatch.setattr("league.environments.conformance.examination.COMPARED_STEPS", 500)
+    monkeypatch.setattr("league.environments.conformance.examination.MEASURED_SECONDS", 0.01)
+
+
 @pytest.fixture(scope="session")
 def parsed_operators() -> Iterator[None]:
     """Torch's ONNX exporter parses its 500 operators at each export, which takes half of its time."""

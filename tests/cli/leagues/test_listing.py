@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 import yaml
 
 from league.registry.registry import Registry
@@ -32,6 +33,7 @@ def test_leagues_are_listed_with_their_last_verdict(league: League, registry: Re
     assert row.split()[:5] == [NAME, "3", "@2", "0f3a62d1", "promote"]
 
 
+@pytest.mark.usefixtures("ray_session")  # `league train` starts a Ray otherwise
 def test_an_archived_league_is_skipped_and_nothing_is_added_to_it(
     league: League, registry: Registry, tmp_path: Path
 ) -> None:

@@ -8,6 +8,8 @@ from league.registry.registry import Registry
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 
+pytestmark = pytest.mark.usefixtures("ray_session")  # `league train` starts a Ray otherwise
+
 OTHER_GAME = """
 league: tictactoe
 environment: {entry_point: pettingzoo.classic.connect_four_v3}

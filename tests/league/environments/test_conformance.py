@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from league.config.league import LeagueConfig
-from league.environments.conformance import episodes, examination, time_budget
+from league.environments.conformance import episodes, time_budget
 from league.environments.conformance.examination import examine
 from league.environments.conformance.findings import Examination
 from league.environments.conformance.openings import OpeningLength, OpeningMeasurement, recommended
@@ -20,12 +20,7 @@ from policy_league.examples.kuhn_poker_vector import KuhnPokerVector
 from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous
 
-
-@pytest.fixture(autouse=True)
-def short_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(examination, "COMPARED_STEPS", 500)
-    monkeypatch.setattr(examination, "MEASURED_SECONDS", 0.01)
-
+pytestmark = pytest.mark.usefixtures("short_examinations")
 
 HERE = "tests.league.environments"
 SUPPORT = "tests.support.environments"
@@ -413,7 +408,10 @@ def test_constant_images_are_a_fault() -> None:
 
 @pytest.mark.parametrize(
     ("game", "kwargs"),
-    [("pistonball_v6", {"n_pistons": 2, "max_cycles": 30}), ("cooperative_pong_v6", {"max_cycles": 30})],
+    [
+        ("pistonball_v6", {"n_pistons": 2, "max_cycles": 30}),
+        pytest.param("cooperative_pong_v6", {"max_cycles": 30}, marks=pytest.mark.slow),
+    ],
 )
 def test_images_of_pettingzoo_are_rendered_without_a_render_mode(game: str, kwargs: dict[str, Any]) -> None:
     found = examine(
