@@ -32,7 +32,6 @@ from tests.support.waiting import until
 
 LEAGUE = "/v1/leagues/tictactoe"
 PLAY = f"{LEAGUE}/play"
-LONG_TIMEOUT = QUICK.model_copy(update={"timeout": 120.0})
 
 
 class LocalEvaluation:
@@ -100,9 +99,7 @@ def client(playable: Registry) -> Iterator[TestClient]:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in playable.storage.environment.items():
             patch.setenv(name, value)
-        server = Replica(
-            Registry.open(playable.storage), LONG_TIMEOUT, "replica-1", evaluation_client=LocalEvaluation(pool)
-        )
+        server = Replica(Registry.open(playable.storage), QUICK, "replica-1", evaluation_client=LocalEvaluation(pool))
         with local_client(server) as client:
             yield client
     pool.close()

@@ -20,13 +20,10 @@ from tests.support.clients.actions import BOARD, act, boards
 from tests.support.leagues.served_leagues import publish
 from tests.support.policies.graphs import ENDLESS, endless_mlp
 from tests.support.servers.exposition import value
-from tests.support.servers.replicas import QUICK, replica
+from tests.support.servers.replicas import replica
 from tests.support.waiting import until
 
 FULL = BOARD | {"observation": np.ones((6, 7, 2), int).tolist()}
-
-
-PATIENT = QUICK.model_copy(update={"timeout": 120.0, "run_timeout": 60.0})
 
 
 @pytest.fixture
@@ -51,7 +48,7 @@ def test_a_request_gets_an_error_and_others_are_answered(registry: Registry) -> 
             for name, array in FULL.items()
         ]
     }
-    with replica(registry.storage, PATIENT) as client:
+    with replica(registry.storage) as client:
         assert act(client, version=version, observation=BOARD)["version"] == version
         for _ in range(2):
             reply = client.post(path, json={"observation": FULL})

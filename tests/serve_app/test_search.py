@@ -28,15 +28,13 @@ from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.exposition import value
 from tests.support.servers.local_search import LocalHandle, searching_replica, searching_server
 from tests.support.servers.protocol_servers import Listening
-from tests.support.servers.replicas import QUICK, local_client, replica
+from tests.support.servers.replicas import local_client, replica
 from tests.support.templates import copy_of
 from tests.support.waiting import until
 
 GAMES = [(), (0, 4), (0, 1, 3, 4), (4, 0, 8, 2)]
 SEARCH = 2
 SLOW = 3
-PATIENT = QUICK.model_copy(update={"timeout": 120.0, "run_timeout": 60.0})
-"""The thread that searches has a low priority, and waits long on a busy machine."""
 
 
 @pytest.fixture
@@ -57,7 +55,7 @@ def build_searching(storage: Storage) -> Registry:
 
 @pytest.fixture
 def served(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[TestClient, LocalHandle]]:
-    with searching_replica(registry, monkeypatch, PATIENT) as served:
+    with searching_replica(registry, monkeypatch) as served:
         yield served
 
 
@@ -112,7 +110,7 @@ def test_all_protocols_return_the_actions_of_the_search(
 
 def test_triton_clients_call_it_by_grpc(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     arrays = {name: np.array([board[name] for board in BOARDS], dtype=np.int8) for name in BOARDS[0]}
-    server, _ = searching_server(registry, monkeypatch, PATIENT)
+    server, _ = searching_server(registry, monkeypatch)
     with Listening(server) as address, Triton("grpc", address) as triton:
         result = triton.infer(LEAGUE, arrays, version=str(SEARCH), outputs=("action", "action_dist_inputs"))
     expected = searched(registry).act(arrays)
@@ -218,7 +216,7 @@ def test_a_call_whose_process_ends_is_repeated(served: tuple[TestClient, LocalHa
 
 
 def test_requests_that_wait_together_share_a_message(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    server, handle = searching_server(registry, monkeypatch, PATIENT)
+    server, handle = searching_server(registry, monkeypatch)
     sizes, released, call = list[int](), asyncio.Event(), handle.call
 
     async def hold(method: str, *arguments: Any) -> Any:

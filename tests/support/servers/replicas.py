@@ -10,10 +10,18 @@ from serve_app.app import Replica
 from serve_app.settings import ServeSettings
 
 QUICK = ServeSettings(
-    poll=0.03, poll_slowest=0.05, retry=0.05, heartbeat=0.2, max_body=64 * 1024, max_batch=8, burst_tolerance=60.0
+    poll=0.03,
+    poll_slowest=0.05,
+    retry=0.05,
+    heartbeat=0.2,
+    max_body=64 * 1024,
+    max_batch=8,
+    timeout=120.0,
+    run_timeout=60.0,
+    burst_tolerance=60.0,
 )
-"""Settings of a replica for tests: short intervals and low limits. On a busy machine its queue may last longer than
-usual."""
+"""Settings of a replica for tests: short intervals, low limits, and patience: on a busy machine a healthy request may
+take longer than users wait."""
 READ_ONLY = QUICK.model_copy(update={"poll": 1.0, "poll_slowest": 1.0, "heartbeat": 2.0})
 """Settings of a replica that many tests share and none changes: fast polls would slow down all tests of the process."""
 LOCALHOST = "http://localhost"

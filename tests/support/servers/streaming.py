@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import uvicorn
 
@@ -57,9 +58,10 @@ def listening(
     try:
         yield Listening(f"http://127.0.0.1:{port}", server, runner)
     finally:
-        runner.should_exit = True
-        thread.join(20)
-        assert not thread.is_alive()
+        with patch.object(uvicorn_websocket, "CLOSE_TIMEOUT", 0.2):  # for clients that do not answer
+            runner.should_exit = True
+            thread.join(240)
+            assert not thread.is_alive()
 
 
 @contextmanager
