@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any
 
 import httpx
@@ -12,21 +12,36 @@ from sqlalchemy import text
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
+from league.settings import Storage
 from tests.support.databases import on_both_databases
-from tests.support.leagues.served_leagues import promote
+from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.replicas import replica
 
 CHAMPION = "/v1/leagues/board/aliases/champion"
 ROLLBACK = "/v1/leagues/board/rollback"
 
 
-@pytest.fixture
-def promoter(registry: Registry) -> Iterator[TestClient]:
+@contextmanager
+def promoting(registry: Registry) -> Iterator[TestClient]:
     """A client with a key that may promote."""
     _, token = registry.keys.create("release-bot", ["promote"])
     with replica(registry.storage) as client:
         client.headers["authorization"] = f"Bearer {token}"
         yield client
+
+
+@pytest.fixture
+def promoter(registry: Registry) -> Iterator[TestClient]:
+    with promoting(registry) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient, Registry]]:
+    """A promoter and the registry, for tests of requests that are refused."""
+    registry = everything(Storage.at(tmp_path_factory.mktemp("refused")))
+    with closing(registry), promoting(registry) as client:
+        yield client, registry
 
 
 def change(client: TestClient, path: str, key: str, body: Any = None, status: int = 200) -> dict[str, Any]:
@@ -143,15 +158,17 @@ def test_a_mixture_is_published_once_and_promoted(promoter: TestClient, registry
     ],
 )
 def test_invalid_changes_are_rejected(
-    promoter: TestClient, registry: Registry, path: str, body: Any, status: int, message: str
+    refused: tuple[TestClient, Registry], path: str, body: Any, status: int, message: str
 ) -> None:
+    promoter, registry = refused
     history = registry.aliases.history("board")
     assert message in change(promoter, path, "a", body, status)["message"]
     assert registry.aliases.history("board") == history
 
 
 @pytest.mark.parametrize("key", [None, "", "x" * 256, "a\tb", "é"])
-def test_a_call_requires_an_idempotency_key(promoter: TestClient, registry: Registry, key: str | None) -> None:
+def test_a_call_requires_an_idempotency_key(refused: tuple[TestClient, Registry], key: str | None) -> None:
+    promoter, registry = refused
     headers = [] if key is None else [(b"idempotency-key", key.encode())]
     reply = promoter.post(CHAMPION, json={"version": 2}, headers=headers)  # type: ignore[arg-type]
     assert (reply.status_code, reply.json()["code"]) == (400, "invalid_input")

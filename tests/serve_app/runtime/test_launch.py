@@ -33,16 +33,16 @@ def test_invalid_settings_are_reported(storage: Storage, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("text", ["", "applications: []", "http_options: {}", "a: [", "- 1"])
-def test_an_invalid_deploy_yaml_is_reported(storage: Storage, tmp_path: Path, text: str) -> None:
+def test_an_invalid_deploy_yaml_is_reported(tmp_path: Path, text: str) -> None:
     deploy = tmp_path / "deploy.yaml"
     deploy.write_text(text)
-    with pytest.raises(ConfigError, match=r"deploy\.yaml"), running(storage, deploy=deploy):
-        pass
+    with pytest.raises(ConfigError, match=r"deploy\.yaml"):
+        load_document(deploy, None, None, None, None, None, insecure=False)
 
 
-def test_a_missing_deploy_yaml_is_reported(storage: Storage, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"nowhere\.yaml"), running(storage, deploy=tmp_path / "nowhere.yaml"):
-        pass
+def test_a_missing_deploy_yaml_is_reported(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml"):
+        load_document(tmp_path / "nowhere.yaml", None, None, None, None, None, insecure=False)
 
 
 def test_an_unusable_home_is_reported(tmp_path: Path) -> None:
