@@ -37,7 +37,7 @@ def registry(tmp_path: Path) -> Iterator[Registry]:
 
 
 def config(**gate: Any) -> LeagueConfig:
-    return tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate=gate)
+    return tictactoe.config(play={"opening_plies": 2, "num_envs": 32}, gate=gate)
 
 
 def promote(registry: Registry, *versions: int) -> None:

@@ -15,12 +15,12 @@ GATE = {"elo0": 0, "elo1": 100, "max_blocks": 20, "nights": None, "confirmation_
 
 
 def register(registry: Registry, **play: Any) -> None:
-    league = tictactoe.config(play={"opening_plies": 2, "num_envs": 8} | play, gate=GATE)
+    league = tictactoe.config(play={"opening_plies": 2, "num_envs": 32} | play, gate=GATE)
     registry.leagues.register(league, interface(league))
 
 
 def test_an_open_verdict_becomes_void_and_ratings_start_anew(tmp_path: Path) -> None:
-    registry = tictactoe.registry(tmp_path, play={"opening_plies": 2, "num_envs": 8}, gate=GATE)
+    registry = tictactoe.registry(tmp_path, play={"opening_plies": 2, "num_envs": 32}, gate=GATE)
     tictactoe.publish(registry, tictactoe.graph(wins=True, blocks=True))
     row = registry.leagues.get(tictactoe.LEAGUE)
     first = conclude(registry, open_verdict(registry, row, 1, "script:random"))
@@ -50,7 +50,7 @@ def test_an_open_verdict_becomes_void_and_ratings_start_anew(tmp_path: Path) -> 
 
 
 def test_games_before_a_change_promote_nobody(tmp_path: Path) -> None:
-    registry = tictactoe.registry(tmp_path, play={"opening_plies": 2, "num_envs": 8}, gate=GATE)
+    registry = tictactoe.registry(tmp_path, play={"opening_plies": 2, "num_envs": 32}, gate=GATE)
     tictactoe.publish(registry, tictactoe.graph(wins=True, blocks=True))
     opened = open_verdict(registry, registry.leagues.get(tictactoe.LEAGUE), 1, "script:random")
     is_registered = False

@@ -174,7 +174,7 @@ def test_a_run_that_died_after_any_transaction_continues(
 ) -> None:
     """After a crash at each single transaction, the final state equals that of an uninterrupted run."""
     gate = {"elo1": 150, "max_blocks": 100, "nights": 2, "alpha": 0.2, "anchors": ["script:random"], "margin": 150}
-    config = tictactoe.config(gate=gate, play={"opening_plies": 2, "num_envs": 16})
+    config = tictactoe.config(gate=gate, play={"opening_plies": 2, "num_envs": 32})
     league_of(tmp_path / "fresh", MIDDLING, STRONG, config=config).close()
     quiet = _copy(tmp_path / "fresh", tmp_path / "quiet")
     with crash_after(0, monkeypatch) as count:
@@ -204,7 +204,7 @@ def test_candidates_are_tested_with_the_search_of_the_champion(tmp_path: Path, m
         return candidates, [row.outcome for row in rows], len(content["matches"]), content["nights"]
 
     gate = {"max_blocks": 4, "nights": 2, "confirmation_blocks": 0}
-    config = tictactoe.config(gate=gate, play={"opening_plies": 2, "num_envs": 16})
+    config = tictactoe.config(gate=gate, play={"opening_plies": 2, "num_envs": 32})
     with closing(league_of(tmp_path / "fresh", config=config)) as fresh:
         value = masked_mlp((3, 3, 2), 9, has_value=True)
         tictactoe.publish(fresh, masked_mlp((3, 3, 2), 9), value=value)
@@ -393,7 +393,7 @@ def test_hypotheses_out_of_range_are_rejected() -> None:
 
 def test_a_candidate_without_the_required_shadow_traffic_is_not_tested(tmp_path: Path) -> None:
     gate = {"shadow_agreement": 0.5, "latency_ms": 10, "shadow_observations": 10}
-    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate=gate)
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 32}, gate=gate)
     registry = league_of(tmp_path / "home", MIDDLING, STRONG, STRONGEST, config=config)
     registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="test", reason="test")
     latency = (0, 100, *[0] * (len(BOUNDS) - 1))
@@ -411,7 +411,7 @@ def test_a_candidate_without_the_required_shadow_traffic_is_not_tested(tmp_path:
 
 def test_members_of_a_champion_are_shadowed_in_its_place(tmp_path: Path) -> None:
     gate = {"shadow_agreement": 0.5, "shadow_observations": 150}
-    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate=gate)
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 32}, gate=gate)
     registry = league_of(tmp_path / "home", MIDDLING, MIDDLING, STRONGEST, config=config)
     mixture = registry.publisher.publish_mixture(tictactoe.LEAGUE, {1: 0.5, 2: 0.5}).number
     registry.aliases.set(tictactoe.LEAGUE, "champion", mixture, expected=None, actor="test", reason="test")
@@ -425,7 +425,7 @@ def test_members_of_a_champion_are_shadowed_in_its_place(tmp_path: Path) -> None
 
 def test_the_latency_limit_applies_to_the_slowest_requests(tmp_path: Path) -> None:
     """Nine of ten observations took 50 µs, the others up to 250 ms: the median is within the limit, the tail is not."""
-    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate={"latency_ms": 10})
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 32}, gate={"latency_ms": 10})
     registry = league_of(tmp_path / "home", MIDDLING, STRONG, config=config)
     registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="test", reason="test")
     latency = [0] * (len(BOUNDS) + 1)
@@ -439,14 +439,14 @@ def test_the_latency_limit_applies_to_the_slowest_requests(tmp_path: Path) -> No
 
 
 def test_shadow_traffic_is_not_required_without_a_champion(tmp_path: Path) -> None:
-    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate={"shadow_agreement": 1.0})
+    config = tictactoe.config(play={"opening_plies": 2, "num_envs": 32}, gate={"shadow_agreement": 1.0})
     registry = league_of(tmp_path / "home", STRONG, config=config)
     assert outcomes(nightly(config, registry=registry)) == [("tictactoe@1", "script:random", "promote", True)]
     registry.close()
 
 
 def with_yearly_alpha(**gate: Any) -> LeagueConfig:
-    return tictactoe.config(play={"opening_plies": 2, "num_envs": 16}, gate={"nights": 365, "max_blocks": 1000} | gate)
+    return tictactoe.config(play={"opening_plies": 2, "num_envs": 32}, gate={"nights": 365, "max_blocks": 1000} | gate)
 
 
 def test_the_alpha_of_a_night_is_divided_among_its_candidates(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, WEA
 from tests.support.policies.graphs import masked_mlp
 
 GATE = {"elo1": 150, "max_blocks": 100, "confirmation_blocks": 4, "exploiters": {"blocks": 4}}
-CONFIG = tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 16})
+CONFIG = tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 32})
 LEAGUE = tictactoe.LEAGUE
 
 
@@ -146,7 +146,7 @@ def test_a_champion_that_changes_during_training_is_the_opponent_of_the_gate(reg
 def test_an_algorithm_without_opponents_trains_no_exploiter(registry: Registry) -> None:
     announced: list[str] = []
     night, _ = training_night(
-        tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 16}, training={"algorithm": "maddpg"}),
+        tictactoe.config(gate=GATE, play={"opening_plies": 2, "num_envs": 32}, training={"algorithm": "maddpg"}),
         registry=registry,
         train=(trainer := trainer_of(registry, STRONG)),
         announce=announced.append,

@@ -6,7 +6,7 @@ from league.config.league import LeagueConfig
 from league.registry.registry import Registry
 from tests.support.leagues import tictactoe
 
-CONFIG = tictactoe.config(play={"opening_plies": 2, "num_envs": 16})
+CONFIG = tictactoe.config(play={"opening_plies": 2, "num_envs": 32})
 
 WEAK = tictactoe.graph()
 

@@ -12,7 +12,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.leagues import tictactoe
 
-CONFIG = tictactoe.config(play={"opening_plies": 2, "num_envs": 16})
+CONFIG = tictactoe.config(play={"opening_plies": 2, "num_envs": 32})
 HOSTILE = "</script><script>alert('mine')</script><img src=x onerror=alert(1)> & more"
 ROLES = {"adversary": ["adversary_*"], "good": ["agent_*"]}
 
