@@ -45,6 +45,7 @@ def test_a_test_that_passes_alone_is_flaky(tmp_path: Path) -> None:
     assert (tmp_path / "build" / "gate" / "name.xml").exists()
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_fails_one_test_and_all_others_run(tmp_path: Path) -> None:
     several = "@pytest.mark.parametrize('text', [*'abcd', 'a/b.py::c[d]', *'ghij'])\n"
     fatal = "def test_it(text): '::' in text and is_first_time() and die()"
@@ -69,21 +70,39 @@ IN_ONE_OF_MANY_FILES = "def test_it(): assert not is_first_time(Path(__file__ + 
             {"test_a": "def test_it():\n    is_first_time() or pytest.skip()\n    assert False"},
             "BROKEN test_a.py::test_it",
             id="skipped alone",
+            marks=pytest.mark.slow,
         ),
-        pytest.param({"test_a": "def test_it(): die()"}, "BROKEN test_a.py::test_it", id="a killed process, always"),
-        pytest.param({"conftest": SESSION_FIXTURE, "test_a": PASSING}, "BROKEN test_a.py::test_passes", id="a fixture"),
-        pytest.param({"test_a": "import no_such_module", "test_b": PASSING}, "", id="a file that cannot be imported"),
+        pytest.param(
+            {"test_a": "def test_it(): die()"},
+            "BROKEN test_a.py::test_it",
+            id="a killed process, always",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"conftest": SESSION_FIXTURE, "test_a": PASSING},
+            "BROKEN test_a.py::test_passes",
+            id="a fixture",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"test_a": "import no_such_module", "test_b": PASSING},
+            "",
+            id="a file that cannot be imported",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {f"test_{letter}": IN_ONE_OF_MANY_FILES for letter in "abcd"},
             "nothing is repeated: 4 failed in 4 files",
             id="many files",
+            marks=pytest.mark.slow,
         ),
         pytest.param(
             {"conftest": "def pytest_configure(config): hasattr(config, 'workerinput') and die()", "test_a": PASSING},
             "",
             id="processes that die when they start",
+            marks=pytest.mark.slow,
         ),
-        pytest.param({"test_a": ""}, "", id="no test"),
+        pytest.param({"test_a": ""}, "", id="no test", marks=pytest.mark.slow),
     ],
 )
 def test_a_fault_is_red(tmp_path: Path, files: dict[str, str], last: str) -> None:
@@ -93,12 +112,14 @@ def test_a_fault_is_red(tmp_path: Path, files: dict[str, str], last: str) -> Non
     assert "FLAKY" not in process.stdout
 
 
+@pytest.mark.slow
 def test_a_run_that_leaves_tests_out_is_red(tmp_path: Path) -> None:
     process = run(tmp_path, {"test_a": IN_ONE_OF_MANY_FILES, "test_b": "def test_it(): time.sleep(1)"}, "--maxfail=1")
     assert process.returncode > 1, process.stdout
     assert "FLAKY" not in process.stdout
 
 
+@pytest.mark.slow
 def test_a_run_that_does_not_end_is_stopped(tmp_path: Path) -> None:
     process = run(tmp_path, {"test_a": "def test_it(): time.sleep(600)"}, seconds=4)
     assert process.returncode == 124

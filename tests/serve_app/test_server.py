@@ -41,6 +41,8 @@ from tests.support.servers.scaling import scale
 from tests.support.servers.under_load import ACTION, RayServer, load, processes, serving
 from tests.support.waiting import until
 
+pytestmark = pytest.mark.slow  # a real server takes all cores
+
 EVALUATIONS = "/v1/leagues/tictactoe/evaluations"
 
 
@@ -77,6 +79,7 @@ def test_replicas_have_the_priority_of_the_server(served: Registry) -> None:
     assert {os.getpriority(os.PRIO_PROCESS, pid) for pid in replicas} == {own}
 
 
+@pytest.mark.e2e
 def test_all_processes_of_a_local_server_listen_on_loopback(served: Registry) -> None:
     # Of Ray, its agents, replicas and HAProxy, which may be starting again.
     until(lambda: len({name for name, _ in listeners(served.storage)}) > 5)
@@ -201,7 +204,6 @@ def test_a_remote_policy_acts_as_the_graph(url: str, served: Registry) -> None:
         np.testing.assert_array_equal(policy.act(batch).actions, expected)
 
 
-@pytest.mark.slow
 @pytest.mark.e2e
 def test_promotions_under_load_lose_no_request(url: str, served: Registry) -> None:
     def caller() -> Callable[[], int]:
@@ -226,7 +228,9 @@ def test_promotions_under_load_lose_no_request(url: str, served: Registry) -> No
     assert seen.versions.keys() == {1, 2, 3}
 
 
-@pytest.mark.parametrize("has_length", [True, False], ids=["content length", "chunked"])
+@pytest.mark.parametrize(
+    "has_length", [True, pytest.param(False, marks=pytest.mark.e2e)], ids=["content length", "chunked"]
+)
 def test_a_body_of_a_hundred_megabytes_is_rejected(url: str, served: Registry, has_length: bool) -> None:
     size, part = 100 * 2**20, b" " * 2**16
     until(lambda: len(peaks(served.storage)) == 2)
@@ -254,7 +258,6 @@ def peaks(storage: Storage) -> dict[int, int]:
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.e2e
 def test_our_client_survives_the_death_of_a_replica(url: str, served: Registry) -> None:
     victim = processes(served.storage, "PolicyServer")[0]
@@ -272,6 +275,7 @@ def test_our_client_survives_the_death_of_a_replica(url: str, served: Registry) 
     until(lambda: len(set(processes(served.storage, "PolicyServer")) - {victim}) == 2)
 
 
+@pytest.mark.e2e
 def test_promotions_end_no_stream(url: str, served: Registry) -> None:
     promote(served, "board", 1)
     until(lambda: serving(served, 1) >= 2)
@@ -285,7 +289,6 @@ def test_promotions_end_no_stream(url: str, served: Registry) -> None:
             assert (pinned.version, following.version) == (1, version)
 
 
-@pytest.mark.slow
 def test_event_streams_outlast_the_timeouts_of_the_server(url: str, served: Registry) -> None:
     """HAProxy cuts a response without data for 5 s."""
     with listen(url) as stream:
@@ -298,7 +301,6 @@ def test_event_streams_outlast_the_timeouts_of_the_server(url: str, served: Regi
     until(lambda: serving(served, 1) >= 2)
 
 
-@pytest.mark.slow
 def test_episodes_survive_a_draining_replica(ray_server: RayServer, served: Registry) -> None:
     """The observations are ones, and the third action is 1: without its state, a policy would answer 0.
 
@@ -396,7 +398,6 @@ def evaluate_locally(directory: Path, blocks: int) -> tuple[EvaluationReport, li
     return report, matches
 
 
-@pytest.mark.slow
 def test_a_killed_evaluation_continues_and_equals_league_evaluate(
     evaluator: httpx.Client, served: Registry, tmp_path: Path
 ) -> None:
@@ -434,7 +435,6 @@ def test_an_evaluation_is_stopped_between_chunks(evaluator: httpx.Client, served
     until(lambda: not processes(served.storage, "evaluation.service.evaluation_job"))
 
 
-@pytest.mark.slow
 def test_a_concurrent_nightly_run_fails_and_the_next_one_promotes(evaluator: httpx.Client, served: Registry) -> None:
     locks = served.storage.home / "locks"
     locks.mkdir(exist_ok=True)
@@ -447,7 +447,6 @@ def test_a_concurrent_nightly_run_fails_and_the_next_one_promotes(evaluator: htt
     assert served.aliases.current("tictactoe")["champion"] == 2
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_the_evaluation_service_runs_only_while_it_is_needed(tmp_path: Path) -> None:
     registry = Registry.open(Storage.at(tmp_path))
@@ -488,7 +487,6 @@ def test_a_recorded_game_is_shown_and_rendered_as_video(evaluator: httpx.Client,
     assert retry_until_ready(lambda: evaluator.get(f"{game}/video.gif")).content[:6] == b"GIF89a"
 
 
-@pytest.mark.slow
 def test_a_game_survives_the_death_of_any_process(evaluator: httpx.Client, served: Registry) -> None:
     body: dict[str, Any] = {"opponent": "tictactoe@2", "agent": "player_1", "chances": True, "actions": []}
 
@@ -517,7 +515,6 @@ def only_process(storage: Storage, name: str) -> int:
     return processes(storage, name)[0]
 
 
-@pytest.mark.slow
 def test_the_metrics_of_ray_contain_actions(storage: Storage) -> None:
     """The count of requests, and the gauges that Ray's dashboard shows of autoscaling."""
     with running(storage, replicas=1, dashboard=True) as url:
@@ -538,7 +535,6 @@ def test_the_metrics_of_ray_contain_actions(storage: Storage) -> None:
         until(lambda: total("autoscaling_total_requests") > 0)
 
 
-@pytest.mark.slow
 def test_a_killed_server_can_be_restarted(storage: Storage) -> None:
     (port,) = haproxy.free_ports(1, "127.0.0.1")
     with running(storage, port=port, replicas=1) as url:

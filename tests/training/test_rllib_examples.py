@@ -47,7 +47,13 @@ def test_the_page_lists_all_of_them() -> None:
     assert set(listed()) == shipped()
 
 
-@pytest.mark.parametrize("name", listed())
+LONG = ("multi_agent.pettingzoo_chess:MultiAgentChess", "multi_agent:MultiAgentMountainCar")
+"""Their episodes take seconds."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in listed()]
+)
 def test_each_is_accepted_or_refused_as_listed(name: str) -> None:
     arguments, reason = listed()[name]
     environment = {"entry_point": f"{examples.__name__}.{name}", "kwargs": arguments}

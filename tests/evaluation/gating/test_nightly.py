@@ -192,7 +192,10 @@ def test_a_run_that_died_after_any_transaction_continues(
         registry.close()
 
 
-def test_candidates_are_tested_with_the_search_of_the_champion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("every", [30, pytest.param(6, marks=pytest.mark.slow)])
+def test_candidates_are_tested_with_the_search_of_the_champion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int
+) -> None:
     """Also after a crash at transactions of the nightly run."""
 
     def tested(registry: Registry) -> object:
@@ -227,7 +230,7 @@ def test_candidates_are_tested_with_the_search_of_the_champion(tmp_path: Path, m
         nightly(config, registry=plain)
         candidates = {row.candidate for row in plain.verdicts.all(tictactoe.LEAGUE)}
     assert 3 not in candidates, "it was tested with the search of the former champion"
-    for crash_at in range(count[0], 0, -6):
+    for crash_at in range(count[0], 0, -every):
         with closing(_copy(tmp_path / "fresh", tmp_path / str(crash_at))) as registry:
             with crash_after(crash_at, monkeypatch), pytest.raises(ProcessDeath):
                 nightly(config, registry=registry)

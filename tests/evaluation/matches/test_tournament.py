@@ -118,6 +118,7 @@ def test_a_chunk_is_as_long_as_all_earlier_ones_within_limits(num_envs: int, bou
     assert [chunk.stop for chunk in chunks_of(bounds[-1], 0, num_envs)] == bounds
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_ray_plays_the_same_matches(registry: Registry) -> None:
     schedule = tournament_schedule(registry)

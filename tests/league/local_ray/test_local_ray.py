@@ -12,12 +12,14 @@ from league.local_ray import token
 DEADLINE = 240
 TOKENS = (token.MODE, token.TOKEN, token.TOKEN_FILE)
 START = """
-import os, re, sys, threading
+import os, signal, sys, threading
+from contextlib import suppress
 import psutil, ray
 from ray._private import services
 from league.local_ray import loopback_node, token
 from ray._private.authentication.http_token_authentication import get_auth_headers_if_auth_enabled
 from league.ray_cluster import PRELOAD, LocalRay, join, ray_session, start_local
+from tests.support.waiting import until
 
 loopback_node.NOTICE = 0.2
 this = psutil.Process()
@@ -25,12 +27,21 @@ this = psutil.Process()
 def below(name):
     found = []
     for process in this.children(recursive=True):
-        try:
+        with suppress(psutil.NoSuchProcess):
             if process.name() == name or any(part.endswith(name) for part in process.cmdline()):
                 found.append(process)
-        except psutil.NoSuchProcess:
-            pass
     return found
+
+def when_a_raylet_starts(act):
+    start = services.start_ray_process
+
+    def start_and_act(command, process_type, *arguments, **options):
+        started = start(command, process_type, *arguments, **options)
+        if process_type == "raylet":
+            act(started.process)  # before it can register
+        return started
+
+    services.start_ray_process = start_and_act
 
 def run_a_task():
     return ray.get(ray.remote(lambda: "a task ran").remote())
@@ -38,12 +49,11 @@ def run_a_task():
 LISTENERS = """
 start_local(LocalRay(cpus=1))
 print(run_a_task())
-listeners = {
-    connection.laddr.ip.removeprefix("::ffff:")
-    for process in [this, *this.children(recursive=True)]
-    for connection in process.net_connections("tcp")
-    if connection.status == "LISTEN"
-}
+listeners = set()
+for process in [this, *this.children(recursive=True)]:
+    with suppress(psutil.NoSuchProcess):
+        connections = process.net_connections("tcp")
+        listeners |= {one.laddr.ip.removeprefix("::ffff:") for one in connections if one.status == "LISTEN"}
 assert listeners == {"127.0.0.1"}, listeners
 assert ray.util.get_node_ip_address() == "127.0.0.1"
 address = ray.get_runtime_context().gcs_address
@@ -59,8 +69,19 @@ assert "ConfigError: no Ray cluster" in refused.stderr and "CPU" not in refused.
 PROCESSES = """
 start_local(LocalRay(cpus=1))
 print(run_a_task())
-names = [process.name() for process in this.children(recursive=True) if not process.name().startswith("ray::")]
-assert sorted(names) == ["cat", "cat", "gcs_server", "raylet"], names
+
+def names():
+    found = []
+    for process in this.children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            if not process.name().startswith("ray::"):
+                found.append(process.name())
+    return sorted(found)
+
+try:  # a worker that starts has another name first
+    until(lambda: names() == ["cat", "cat", "gcs_server", "raylet"], 60)
+except TimeoutError:
+    sys.exit(f"unexpected processes: {names()}")
 agents, (raylet,) = below("cat"), below("raylet")
 raylet.kill()
 _, alive = psutil.wait_procs(agents, timeout=60)
@@ -68,8 +89,8 @@ print("agents that survive the raylet:", len(alive))
 """
 WAITING_WORKERS = """
 start_local(LocalRay(cpus=1, preload="wave"))
-while not (waiting := below("ray::IDLE")):
-    pass
+until(lambda: below("ray::IDLE"))
+waiting = below("ray::IDLE")
 
 @ray.remote(num_cpus=1)
 class Actor:
@@ -103,41 +124,34 @@ for process in stopped.values():
     process.resume()
 """
 SLOW_RAYLET = """
-is_noticed = threading.Event()
+stopped = []
 print_line = loopback_node.say
+
+def stop(raylet):
+    raylet.send_signal(signal.SIGSTOP)
+    stopped.append(raylet)
 
 def say(line):
     print_line(line)
-    is_noticed.set()
-
-def stop_raylet():
-    while not (found := below("raylet")):
-        pass
-    found[0].suspend()
-    is_noticed.wait()
-    found[0].resume()
+    stopped[0].send_signal(signal.SIGCONT)
 
 loopback_node.say = say
-threading.Thread(target=stop_raylet).start()
+when_a_raylet_starts(stop)
 start_local(LocalRay(cpus=1))
 print(run_a_task())
 """
 DEAD_RAYLETS = """
-from league import ray_cluster
 from league.errors import NotReady
 
 most = int(sys.argv[1])
 killed = []
-start_ray_process = services.start_ray_process
 
-def start_and_kill(command, process_type, *arguments, **options):
-    started = start_ray_process(command, process_type, *arguments, **options)
-    if process_type == "raylet" and len(killed) < most:
-        killed.append(started)
-        started.process.kill()  # before it can register
-    return started
+def kill(raylet):
+    if len(killed) < most:
+        raylet.kill()
+        killed.append(raylet)
 
-services.start_ray_process = start_and_kill
+when_a_raylet_starts(kill)
 try:
     start_local(LocalRay(cpus=1))
     print(run_a_task(), "after", len(killed), "was killed")
@@ -178,10 +192,12 @@ def test_it_listens_on_loopback_and_requires_its_token(tmp_path: Path) -> None:
     assert not (tmp_path / ".ray").exists(), "Ray's own token would be readable by everybody"
 
 
+@pytest.mark.slow
 def test_it_starts_no_process_that_it_does_not_need(tmp_path: Path) -> None:
     assert "agents that survive the raylet: 0" in run(PROCESSES, tmp_path).stdout
 
 
+@pytest.mark.slow
 def test_a_waiting_worker_that_has_imported_a_module_becomes_an_actor(tmp_path: Path) -> None:
     assert "imported before: True" in run(WAITING_WORKERS, tmp_path).stdout
 
@@ -208,6 +224,7 @@ def test_a_process_that_always_ends_is_named(tmp_path: Path) -> None:
     assert "Ray did not start: its process raylet ended; see /" in run(DEAD_RAYLETS, tmp_path, "100").stdout
 
 
+@pytest.mark.slow
 def test_each_has_a_token_of_its_own(tmp_path: Path) -> None:
     assert run(TWICE, tmp_path).stdout.count("a task ran") == 2
 

@@ -18,6 +18,8 @@ from tests.support.servers.protocol_servers import Address
 from tests.support.servers.under_load import RayServer, load, processes, serving
 from tests.support.waiting import until
 
+pytestmark = pytest.mark.slow  # a real server takes all cores
+
 
 @pytest.fixture(scope="module")
 def served(ray_server: RayServer) -> Registry:
@@ -31,16 +33,17 @@ def address(ray_server: RayServer) -> Address:
     return Address(ray_server.url.removeprefix("http://"), ray_server.grpc)
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("model", ["board", "pistons", "chess", "vector", "choice"])
-def test_each_form_of_the_client_is_answered(address: Address, served: Registry, form: str, model: str) -> None:
-    policy, signature = policy_of(served.storage, model)
-    arrays = observations(signature, 4)
-    with Triton(form, address) as triton:
-        assert triton.call("is_server_live")
-        assert triton.call("is_server_ready")
-        assert triton.call("is_model_ready", model, "champion")
-        assert_same(triton.infer(model, arrays).as_numpy("action"), policy.act(arrays).actions)
+@pytest.mark.e2e
+def test_each_form_of_the_client_is_answered(address: Address, served: Registry) -> None:
+    for model in ("board", "pistons", "chess", "vector", "choice"):
+        policy, signature = policy_of(served.storage, model)
+        arrays = observations(signature, 4)
+        for form in FORMS:
+            with Triton(form, address) as triton:
+                assert triton.call("is_server_live"), form
+                assert triton.call("is_server_ready"), form
+                assert triton.call("is_model_ready", model, "champion"), (model, form)
+                assert_same(triton.infer(model, arrays).as_numpy("action"), policy.act(arrays).actions)
 
 
 def test_calls_on_one_channel_reach_all_replicas(address: Address, served: Registry) -> None:
@@ -61,7 +64,6 @@ def wait_for_both_replicas(triton: Triton, served: Registry) -> None:
     until(have_answered)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("form", ["http", "grpc"])
 def test_all_replicas_report_the_sum_of_their_statistics(address: Address, form: str) -> None:
     """Soon after the last request, each answers with the number of requests that clients sent."""
@@ -92,7 +94,6 @@ def test_a_promotion_applies_to_both_protocols(address: Address, served: Registr
                 assert found == str(version)
 
 
-@pytest.mark.slow
 @pytest.mark.e2e
 def test_retried_calls_survive_the_death_of_a_replica(address: Address, served: Registry) -> None:
     arrays = {"observation": np.zeros((1, 2), np.float32)}

@@ -456,6 +456,8 @@ def _listening(process: psutil.Process) -> set[Any]:
     return {each.laddr for each in found if each.status == psutil.CONN_LISTEN}
 
 
+@pytest.mark.slow
+@pytest.mark.e2e
 class TestServer:
     """A real server, with Ray Serve and HAProxy."""
 

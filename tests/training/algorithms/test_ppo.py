@@ -105,7 +105,6 @@ def test_a_slow_runner_is_waited_for_and_a_lost_one_ends_training() -> None:
         algorithm.stop()
 
 
-@pytest.mark.usefixtures("ray_session")
 def is_lost(runner: Any) -> bool:
     try:
         ray.get(runner.ping.remote())
@@ -114,6 +113,8 @@ def is_lost(runner: Any) -> bool:
     return False
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
 def test_a_runner_lost_before_a_checkpoint_ends_training() -> None:
     """Its sample in flight is not needed, but the runner is."""
     algorithm = build(tictactoe(runners=1, **SMALL))
@@ -158,7 +159,15 @@ def recorded(league: LeagueConfig, updates: int) -> Recording:
 
 
 @pytest.mark.usefixtures("ray_session")
-@pytest.mark.parametrize(("lag", "runners", "effective"), [(0, 2, 0), (1, 2, 1), (2, 1, 2), (1, 0, 0)])
+@pytest.mark.parametrize(
+    ("lag", "runners", "effective"),
+    [
+        pytest.param(0, 2, 0, marks=pytest.mark.slow),
+        pytest.param(1, 2, 1, marks=pytest.mark.slow),
+        pytest.param(2, 1, 2, marks=pytest.mark.slow),
+        (1, 0, 0),
+    ],
+)
 def test_a_sample_is_from_the_weights_of_a_fixed_earlier_update(lag: int, runners: int, effective: int) -> None:
     """Except for actions whose results the sample before did not contain."""
     algorithm = recorded(tictactoe(runners=runners, lag=lag, **SMALL), updates=5)
@@ -178,6 +187,7 @@ def test_a_sample_is_from_the_weights_of_a_fixed_earlier_update(lag: int, runner
             assert min(differences) < 1e-6 < np.partition(differences, 1)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 @pytest.mark.parametrize("critic", ["own", "central"])
 def test_equal_seeds_give_equal_weights_while_runners_and_learner_overlap(critic: str) -> None:
@@ -206,6 +216,7 @@ def test_phases_follow_the_updates_after_restoring(tmp_path: Any) -> None:
     assert changed == [{"a"}, {"b"}, {"b"}, {"a"}, {"b"}, {"b"}, {"a"}]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_the_teacher_acts_in_all_runners_while_its_weight_is_not_zero() -> None:
     """And only on the steps of policies that learn."""

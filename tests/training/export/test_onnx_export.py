@@ -162,6 +162,7 @@ def test_near_ties_are_counted_but_accepted(exported: Exported, tmp_path: Path) 
     assert proof.near_ties == (masks[:, :2] == 1).all(-1).sum() > 0
 
 
+@pytest.mark.slow
 def test_near_ties_are_accepted_if_the_previous_action_is_an_input(tmp_path: Path) -> None:
     """The state after a near tie contains one or the other action."""
     league = solvable_by_dqn("masked", **MEMORY)

@@ -293,8 +293,17 @@ def exported(network: nn.Module, shape: tuple[int, ...], opset: int | None) -> M
         return onnx.load_from_string(file.getvalue())
 
 
-@pytest.mark.parametrize("opset", [None, 17])
-@pytest.mark.parametrize("network", NETWORKS)
+EACH_TIME = {("dense", None), ("residual", 17), ("LSTM", None), ("GRU", 17)}
+
+
+@pytest.mark.parametrize(
+    ("network", "opset"),
+    [
+        pytest.param(network, opset, marks=() if (network, opset) in EACH_TIME else pytest.mark.slow)
+        for network in NETWORKS
+        for opset in (None, 17)
+    ],
+)
 def test_networks_of_torch_are_accepted(network: str, opset: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also by the check of all batches."""
     module, shape = NETWORKS[network]

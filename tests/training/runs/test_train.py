@@ -114,6 +114,7 @@ def test_a_run_publishes_its_checkpoints_and_its_curves(trained: Trained) -> Non
         train(LEAGUE, registry=registry, resume=True)
 
 
+@pytest.mark.slow
 def test_the_run_of_a_night_does_not_change_the_settings_of_its_league(trained: Trained) -> None:
     registry = trained.registry
     before = registry.leagues.get("tictactoe").config
@@ -270,6 +271,7 @@ def test_a_failed_parity_check_ends_the_run_and_keeps_earlier_versions(
     assert steps == sorted(set(steps))
 
 
+@pytest.mark.slow
 def test_continued_training_requires_the_same_network(trained: Trained) -> None:
     """Settings that did not exist when the version was trained have their defaults."""
     version, *_ = trained.versions

@@ -151,7 +151,11 @@ def test_checkpoints_are_saved_at_their_interval_with_the_curves(tmp_path: Path)
 @pytest.mark.usefixtures("ray_session", "a_report_per_checkpoint")
 @pytest.mark.parametrize(
     ("environment", "seeds", "runners"),
-    [(TICTACTOE, "stock", 0), (TICTACTOE, "stock", 1), ("pettingzoo.classic.leduc_holdem_v4", "fast", 0)],
+    [
+        (TICTACTOE, "stock", 0),
+        pytest.param(TICTACTOE, "stock", 1, marks=pytest.mark.slow),
+        ("pettingzoo.classic.leduc_holdem_v4", "fast", 0),
+    ],
 )
 def test_restored_training_equals_uninterrupted_training(
     tmp_path: Path, environment: str, seeds: str, runners: int

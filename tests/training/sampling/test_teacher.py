@@ -87,7 +87,7 @@ def test_unsuitable_actions_are_rejected() -> None:
         algorithm_config(league, interface(league))
 
 
-@pytest.mark.parametrize("runners", [0, 2])
+@pytest.mark.parametrize("runners", [0, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("ref", "error", "message"),
     [
