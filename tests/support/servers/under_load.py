@@ -11,7 +11,9 @@ from typing import Any
 
 import yaml
 
+from league.registry.processes import has_ended
 from league.registry.registry import Registry
+from league.registry.replicas import PROCESS
 from league.settings import Storage
 from serve_app.runtime.launch import DEPLOY_YAML
 
@@ -44,8 +46,9 @@ def processes(storage: Storage, name: str) -> list[int]:
 
 
 def serving(registry: Registry, version: int) -> int:
-    """The number of replicas that report serving a version of `board`."""
-    return sum(row.version == version for row in registry.replicas.acknowledgements("board"))
+    """The number of running replicas that report serving a version of `board`. A killed one stays registered."""
+    running = {row.replica for row in registry.replicas.registered() if not has_ended(row.process[PROCESS])}
+    return sum(row.version == version for row in registry.replicas.acknowledgements("board") if row.replica in running)
 
 
 @dataclass(frozen=True)
