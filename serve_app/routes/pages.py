@@ -117,7 +117,7 @@ class StaticFile:
     @classmethod
     @cache
     def of(cls, path: Path, plain: bytes) -> StaticFile:
-        """Compress the content of a file, once in a process: several replicas may share it, in tests hundreds do."""
+        """Compress the content of a file, unless this process has done so before."""
         zipped = gzip.compress(plain, mtime=0) if len(plain) >= MIN_COMPRESSED_BYTES else None
         return cls(plain, zipped, MEDIA_TYPES[path.suffix], f'W/"{sha256(plain).hexdigest()[:24]}"')
 

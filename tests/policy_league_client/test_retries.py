@@ -91,15 +91,15 @@ def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_promotion_is_retried_with_the_same_idempotency_key(connect: Connect, server: Server) -> None:
-    server.prepare(DROP, 503, DROP, then=MOVED)
-    client = connect(server.url, key="plk_x", timeout=60.0)
+    server.prepare(DROP, 503, NO_RESPONSE, then=MOVED)
+    client = connect(server.url, key="plk_x", timeout=0.3)
     assert client.promote("board@2", expected=1, reason="better").event == 3
     bodies, headers = zip(*server.requests, strict=True)
-    assert len(bodies) == 4
+    assert len(bodies) >= 4, "a busy machine may be late for the last attempt, too"
     assert set(bodies) == {b'{"version":2,"expected":1,"reason":"better"}'}
     assert len({sent["idempotency-key"] for sent in headers}) == 1
     assert {sent["authorization"] for sent in headers} == {"Bearer plk_x"}
-    assert {sent["x-request-timeout-ms"] for sent in headers} == {"60000"}
+    assert {sent["x-request-timeout-ms"] for sent in headers} == {"300"}
     client.promote("board@2", idempotency_key="mine")
     assert server.requests[-1][1]["idempotency-key"] == "mine"
     client.rollback("board")
