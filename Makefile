@@ -52,10 +52,10 @@ coverage: setup
 
 # Learning to a level, every environment, kills and clusters: PART=serving or TESTS=tests/cli runs some of them. A cluster
 # that serves under load needs all cores; clients in other languages need Node.js 20 and npm's registry.
-pages := tests/browser tests/test_docs.py tests/test_run_tests.py
+pages := tests/browser tests/test_docs.py
 serving := tests/serve_app tests/cli tests/policy_league_client tests/test_tutorial.py tests/test_wheel.py
 training := tests/training tests/examples tests/test_environments.py tests/test_restore_parity.py
-evaluation := tests/evaluation tests/league tests/benchmarks
+evaluation := tests/evaluation tests/league tests/benchmarks tests/test_run_tests.py
 clusters := tests/cluster tests/clients
 PARTS := pages serving training evaluation clusters
 

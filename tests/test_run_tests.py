@@ -62,53 +62,36 @@ SESSION_FIXTURE = "@pytest.fixture(autouse=True, scope='session')\ndef never(): 
 IN_ONE_OF_MANY_FILES = "def test_it(): assert not is_first_time(Path(__file__ + ' was here'))"
 
 
+FAULTS: dict[str, tuple[dict[str, str], str]] = {
+    "a falsehood": ({"test_a": "def test_it(): assert 1 == 2"}, "BROKEN test_a.py::test_it"),
+    "skipped alone": (
+        {"test_a": "def test_it():\n    is_first_time() or pytest.skip()\n    assert False"},
+        "BROKEN test_a.py::test_it",
+    ),
+    "a killed process, always": ({"test_a": "def test_it(): die()"}, "BROKEN test_a.py::test_it"),
+    "a fixture": ({"conftest": SESSION_FIXTURE, "test_a": PASSING}, "BROKEN test_a.py::test_passes"),
+    "a file that cannot be imported": ({"test_a": "import no_such_module", "test_b": PASSING}, ""),
+    "many files": (
+        {f"test_{letter}": IN_ONE_OF_MANY_FILES for letter in "abcd"},
+        "nothing is repeated: 4 failed in 4 files",
+    ),
+    "processes that die when they start": (
+        {"conftest": "def pytest_configure(config): hasattr(config, 'workerinput') and die()", "test_a": PASSING},
+        "",
+    ),
+    "no test": ({"test_a": ""}, ""),
+}
+"""Name → files, and a part of the output."""
+
+
 @pytest.mark.parametrize(
-    ("files", "last"),
-    [
-        pytest.param({"test_a": "def test_it(): assert 1 == 2"}, "BROKEN test_a.py::test_it", id="a falsehood"),
-        pytest.param(
-            {"test_a": "def test_it():\n    is_first_time() or pytest.skip()\n    assert False"},
-            "BROKEN test_a.py::test_it",
-            id="skipped alone",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"test_a": "def test_it(): die()"},
-            "BROKEN test_a.py::test_it",
-            id="a killed process, always",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"conftest": SESSION_FIXTURE, "test_a": PASSING},
-            "BROKEN test_a.py::test_passes",
-            id="a fixture",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"test_a": "import no_such_module", "test_b": PASSING},
-            "",
-            id="a file that cannot be imported",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {f"test_{letter}": IN_ONE_OF_MANY_FILES for letter in "abcd"},
-            "nothing is repeated: 4 failed in 4 files",
-            id="many files",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            {"conftest": "def pytest_configure(config): hasattr(config, 'workerinput') and die()", "test_a": PASSING},
-            "",
-            id="processes that die when they start",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param({"test_a": ""}, "", id="no test", marks=pytest.mark.slow),
-    ],
+    "name", ["a falsehood", *(pytest.param(name, marks=pytest.mark.slow) for name in [*FAULTS][1:])]
 )
-def test_a_fault_is_red(tmp_path: Path, files: dict[str, str], last: str) -> None:
+def test_a_fault_is_red(tmp_path: Path, name: str) -> None:
+    files, part = FAULTS[name]
     process = run(tmp_path, files)
     assert process.returncode != 0, process.stdout
-    assert last in process.stdout
+    assert part in process.stdout
     assert "FLAKY" not in process.stdout
 
 

@@ -16,11 +16,6 @@ def home(tmp_path: Path) -> Path:
     return tmp_path / "home"
 
 
-@pytest.fixture(autouse=True)
-def measured_shortly(short_examinations: None) -> None:
-    """`init` and `check-env` examine environments."""
-
-
 @pytest.fixture
 def registry(home: Path, storage_at: StorageAt, monkeypatch: pytest.MonkeyPatch) -> Registry:
     """Three versions of tic-tac-toe: one that ignores threats, one that blocks, and one that wins and blocks."""

@@ -14,6 +14,8 @@ from league.registry.registry import Registry
 from tests.support.command import League
 from tests.support.leagues import tictactoe
 
+pytestmark = pytest.mark.usefixtures("ray_session", "short_examinations")  # `league train` starts a Ray otherwise
+
 GAME = '''
 import numpy as np
 from gymnasium import spaces
@@ -50,8 +52,6 @@ class Guess(ParallelEnv):
             self.agents = []
         return observations, rewards, ended, dict.fromkeys(ended, False), {agent: {} for agent in ended}
 '''
-pytestmark = pytest.mark.usefixtures("ray_session")  # `league train` starts a Ray otherwise
-
 TRAINING = {"runners": 0, "num_envs": 2, "steps": 64, "train_batch_size": 32, "minibatch_size": 32, "hidden": [8]}
 
 

@@ -91,6 +91,7 @@ def used(registry: Registry) -> Registry:
     return registry
 
 
+@pytest.mark.usefixtures("short_examinations")
 @pytest.mark.parametrize("module", COMMANDS)
 def test_tables_fit_80_columns(
     league: League, request: pytest.FixtureRequest, tables: StringIO, module: str, monkeypatch: pytest.MonkeyPatch

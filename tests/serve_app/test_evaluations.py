@@ -1,7 +1,6 @@
 """Evaluations over HTTP, without playing games: submitted, rejected, listed and stopped."""
 
 from collections.abc import Iterator
-from contextlib import closing
 from threading import Event
 from typing import Any
 
@@ -9,10 +8,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from league.settings import Storage
 from serve_app.app import Replica
 from tests.support.databases import on_both_databases
-from tests.support.leagues.served_leagues import everything, promote
+from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import QUICK, UnavailableEvaluation, local_client, replica
 from tests.support.waiting import until
 
@@ -26,11 +24,9 @@ def evaluator(client: TestClient, registry: Registry) -> TestClient:
 
 
 @pytest.fixture(scope="module")
-def refused(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient, Registry]]:
-    """An evaluator and the registry, for tests of requests that are refused."""
-    registry = everything(Storage.at(tmp_path_factory.mktemp("refused")))
-    with closing(registry), replica(registry.storage) as client:
-        yield with_key(client, registry, "bot", ["evaluate", "read"]), registry
+def shared_evaluator(shared_registry: Registry) -> Iterator[TestClient]:
+    with replica(shared_registry.storage) as client:
+        yield with_key(client, shared_registry, "bot", ["evaluate", "read"])
 
 
 def with_key(client: TestClient, registry: Registry, name: str, scopes: list[str]) -> TestClient:
@@ -131,12 +127,11 @@ def test_by_default_all_versions_play(evaluator: TestClient) -> None:
     ],
 )
 def test_invalid_evaluations_are_rejected_at_once(
-    refused: tuple[TestClient, Registry], path: str, body: Any, status: int, code: str
+    shared_evaluator: TestClient, shared_registry: Registry, path: str, body: Any, status: int, code: str
 ) -> None:
-    evaluator, registry = refused
-    error = start(evaluator, body, path=path, status=status)
+    error = start(shared_evaluator, body, path=path, status=status)
     assert error["code"] == code
-    assert registry.evaluations.newest("board") == []
+    assert shared_registry.evaluations.newest("board") == []
 
 
 @pytest.mark.parametrize(
@@ -147,8 +142,8 @@ def test_invalid_evaluations_are_rejected_at_once(
         ({"contestants": ["memory@1"]}, "memory@1 is not a version of league board"),
     ],
 )
-def test_the_message_names_the_invalid_value(refused: tuple[TestClient, Registry], body: Any, message: str) -> None:
-    assert message in start(refused[0], body, status=400)["message"]
+def test_the_message_names_the_invalid_value(shared_evaluator: TestClient, body: Any, message: str) -> None:
+    assert message in start(shared_evaluator, body, status=400)["message"]
 
 
 def test_a_nightly_run_requires_a_key_that_may_promote(client: TestClient, registry: Registry) -> None:
@@ -191,8 +186,8 @@ def test_evaluations_are_paginated_newest_first(evaluator: TestClient) -> None:
 
 
 @pytest.mark.parametrize("query", ["limit=0", "limit=101", "limit=x", "before=-1", "before=99999999999"])
-def test_an_invalid_page_is_rejected(refused: tuple[TestClient, Registry], query: str) -> None:
-    assert refused[0].get(f"{BOARD}?{query}").json()["code"] == "invalid_input"
+def test_an_invalid_page_is_rejected(shared_evaluator: TestClient, query: str) -> None:
+    assert shared_evaluator.get(f"{BOARD}?{query}").json()["code"] == "invalid_input"
 
 
 @on_both_databases

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from typing import Any
 
 import httpx
@@ -12,9 +12,8 @@ from sqlalchemy import text
 from starlette.testclient import TestClient
 
 from league.registry.registry import Registry
-from league.settings import Storage
 from tests.support.databases import on_both_databases
-from tests.support.leagues.served_leagues import everything, promote
+from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import replica
 
 CHAMPION = "/v1/leagues/board/aliases/champion"
@@ -37,11 +36,9 @@ def promoter(registry: Registry) -> Iterator[TestClient]:
 
 
 @pytest.fixture(scope="module")
-def refused(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient, Registry]]:
-    """A promoter and the registry, for tests of requests that are refused."""
-    registry = everything(Storage.at(tmp_path_factory.mktemp("refused")))
-    with closing(registry), promoting(registry) as client:
-        yield client, registry
+def shared_promoter(shared_registry: Registry) -> Iterator[TestClient]:
+    with promoting(shared_registry) as client:
+        yield client
 
 
 def change(client: TestClient, path: str, key: str, body: Any = None, status: int = 200) -> dict[str, Any]:
@@ -158,22 +155,22 @@ def test_a_mixture_is_published_once_and_promoted(promoter: TestClient, registry
     ],
 )
 def test_invalid_changes_are_rejected(
-    refused: tuple[TestClient, Registry], path: str, body: Any, status: int, message: str
+    shared_promoter: TestClient, shared_registry: Registry, path: str, body: Any, status: int, message: str
 ) -> None:
-    promoter, registry = refused
-    history = registry.aliases.history("board")
-    assert message in change(promoter, path, "a", body, status)["message"]
-    assert registry.aliases.history("board") == history
+    history = shared_registry.aliases.history("board")
+    assert message in change(shared_promoter, path, "a", body, status)["message"]
+    assert shared_registry.aliases.history("board") == history
 
 
 @pytest.mark.parametrize("key", [None, "", "x" * 256, "a\tb", "é"])
-def test_a_call_requires_an_idempotency_key(refused: tuple[TestClient, Registry], key: str | None) -> None:
-    promoter, registry = refused
+def test_a_call_requires_an_idempotency_key(
+    shared_promoter: TestClient, shared_registry: Registry, key: str | None
+) -> None:
     headers = [] if key is None else [(b"idempotency-key", key.encode())]
-    reply = promoter.post(CHAMPION, json={"version": 2}, headers=headers)  # type: ignore[arg-type]
+    reply = shared_promoter.post(CHAMPION, json={"version": 2}, headers=headers)  # type: ignore[arg-type]
     assert (reply.status_code, reply.json()["code"]) == (400, "invalid_input")
     assert "Idempotency-Key" in reply.json()["message"]
-    assert registry.aliases.current("board")["champion"] == 1
+    assert shared_registry.aliases.current("board")["champion"] == 1
 
 
 def test_changes_always_require_a_key(client: TestClient, registry: Registry) -> None:

@@ -8,6 +8,8 @@ import yaml
 from league.config.league import LeagueConfig
 from tests.support.command import League
 
+pytestmark = pytest.mark.usefixtures("short_examinations")
+
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
 BROKEN = """
 from policy_league.examples.two_step import TwoStep

@@ -486,10 +486,7 @@ def test_the_last_message_to_a_batch_has_the_state_of_each_row(storage: Storage)
         assert close_of(stream)[0] == 1012
 
 
-def test_a_client_that_neither_reads_nor_closes_does_not_block_stopping(
-    storage: Storage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(uvicorn_websocket, "CLOSE_TIMEOUT", 0.2)
+def test_a_client_that_neither_reads_nor_closes_does_not_block_stopping(storage: Storage) -> None:
     with listening(storage) as listener:
         shrink_send_buffers(listener)
         raw = RawClient(listener)

@@ -293,13 +293,14 @@ def exported(network: nn.Module, shape: tuple[int, ...], opset: int | None) -> M
         return onnx.load_from_string(file.getvalue())
 
 
-EACH_TIME = {("dense", None), ("residual", 17), ("LSTM", None), ("GRU", 17)}
+QUICK = {("dense", None), ("residual", 17), ("LSTM", None), ("GRU", 17)}
+"""Each exporter, without a memory and with one."""
 
 
 @pytest.mark.parametrize(
     ("network", "opset"),
     [
-        pytest.param(network, opset, marks=() if (network, opset) in EACH_TIME else pytest.mark.slow)
+        pytest.param(network, opset, marks=() if (network, opset) in QUICK else pytest.mark.slow)
         for network in NETWORKS
         for opset in (None, 17)
     ],
