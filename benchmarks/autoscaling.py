@@ -119,7 +119,7 @@ def _cost(registry: Registry, load: Performance[Steps], seconds: float, target: 
     load.send(rate)
     _busy(replica.cpu_times, seconds / 2)  # after the start, the program still loads what it rarely needs
     least = busy = _busy(replica.cpu_times, seconds)
-    while busy - least < target / 4:
+    while busy - least < target / 8:
         rate *= 2
         load.send(rate)
         busy = _busy(replica.cpu_times, seconds)
