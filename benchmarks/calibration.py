@@ -1,6 +1,6 @@
 """Do verdicts have their nominal error rates?
 
-Simulations of gates, years, anchors and intervals, and gates with real games.
+Simulations of gates, years, anchors, intervals and ratings, and gates with real games.
 
 Each part prints measured values beside their targets. All parts are seeded, so that the numbers are reproducible on any
 machine.
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import binom, binomtest
 
 from benchmarks.harness import Parts, Quick, Target, chosen
-from benchmarks.simulations import coverage, exploiter_gates, null_play, sampled_play
+from benchmarks.simulations import coverage, exploiter_gates, ladders, null_play, sampled_play
 from benchmarks.simulations.shuffled_order import verdicts_of_shuffled_completion
 from benchmarks.simulations.simulated_gates import CELLS, EQUALS, simulate, stronger
 from benchmarks.simulations.simulated_years import boundary, chance, walk
@@ -175,6 +175,11 @@ def intervals(quick: bool) -> Iterator[Target]:
         yield Target(f"coverage of {name}", _percent(part(number, 5)), "%", at_least=94.0, at_most=96.0)
 
 
+def ratings(quick: bool) -> Iterator[Target]:
+    """Ratings of ladders: bias of the best, and coverage of nominal 95 % intervals."""
+    yield from ladders.run(20, 4) if quick else ladders.run(200, 40)
+
+
 PARTS: dict[str, Callable[[bool], Iterator[Target]]] = {
     "gates": gates,
     "years": years,
@@ -185,6 +190,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Target]]] = {
     "exploiters": exploiters,
     "anchors": anchors,
     "intervals": intervals,
+    "ratings": ratings,
 }
 
 

@@ -1,8 +1,7 @@
 """Adaptive pairing: schedules the matches that reduce the uncertainty of the ranking most. Pure.
 
-Strengths follow the Bradley–Terry model with a wide normal prior; their posterior is approximated by a normal
-distribution (Laplace). The value of a match, Φ(-|m|/s) × w s² / (1 + w s²), and the choice of a round are explained in
-docs/statistics.md.
+Strengths are the ratings of `evaluation.statistics.bradley_terry`. The value of a match, (1 + Φ(-m/s)) × w s² / (1 + w
+s²), and the choice of a round are explained in docs/statistics.md.
 
 Sources: M. E. Glickman and S. T. Jensen, "Adaptive paired comparison design", J. Stat. Planning and Inference 127
 (2005), for choosing pairs by expected information; M. Rowland et al., "Multiagent evaluation under incomplete
@@ -20,14 +19,16 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit, ndtr
 
 from evaluation.statistics.blas import single_threaded_blas
+from evaluation.statistics.bradley_terry import ELO, posterior
 from league.random.seeds import generator
 from league.results.records import BlockResult
 
 Floats = NDArray[np.float64]
 Pairing = tuple[int, int]
 
-PRIOR = 600 * math.log(10) / 400
-"""Prior standard deviation of strengths in log odds: 600 Elo."""
+NEAR = 300 / ELO
+"""Log odds below which pairs are equally informative. Otherwise the results would decide which pairs play: a pair of
+neighbours would play until it seems farther apart than it is, and all together would stretch the ladder."""
 
 GROWTH = 16
 """A round adds a sixteenth of the matches so far, and at least one per contestant."""
@@ -67,16 +68,18 @@ def choose(points: Floats, games: Floats, number: int, comparisons: int = 2) -> 
 def _chosen(points: Floats, games: Floats, number: int, comparisons: int) -> list[Pairing]:
     strength, precision = posterior(points, games)
     first, second = np.triu_indices(len(games), 1)
-    gap = strength[first] - strength[second]
+    gap = np.abs(strength[first] - strength[second])
     at_once = math.ceil(number / (STEPS * len(games)))
-    information = at_once * comparisons * expit(gap) * expit(-gap)
     pairings: list[Pairing] = []
     while len(pairings) < number:
         covariance = cho_solve(cho_factor(precision), np.eye(len(precision)))
         diagonal = np.diag(covariance)
         variance = diagonal[first] + diagonal[second] - 2 * covariance[first, second]
+        # The mean of p (1 - p) under the posterior, by the probit approximation of the logistic function.
+        likely = np.where(gap < NEAR, 0.0, gap / np.sqrt(1 + math.pi * variance / 8))
+        information = at_once * comparisons * expit(likely) * expit(-likely)
         gain = information * variance
-        value = ndtr(-np.abs(gap) / np.sqrt(variance)) * gain / (1 + gain)
+        value = (1 + ndtr(-gap / np.sqrt(variance))) * gain / (1 + gain)
         for pair in _disjoint(value, first, second):
             i, j = int(first[pair]), int(second[pair])
             pairings += [(i, j)] * at_once
@@ -95,26 +98,6 @@ def tally(contestants: Mapping[str, int], results: Iterable[BlockResult]) -> tup
         points[[i, j], [j, i]] += block.scores
         games[[i, j], [j, i]] += block.games
     return points, games
-
-
-def posterior(points: Floats, games: Floats) -> tuple[Floats, Floats]:
-    """Maximum a posteriori log odds (n,), and the precision (n, n) of the normal approximation."""
-    strength = np.zeros(len(games))
-    while True:
-        expected = expit(strength[:, None] - strength)
-        information = games * expected * (1 - expected)
-        precision = np.diag(information.sum(axis=1) + PRIOR**-2) - information
-        gradient = (points - games * expected).sum(axis=1) - strength / PRIOR**2
-        step = cho_solve(cho_factor(precision), gradient)
-        farthest = np.abs(step).max()
-        if farthest < TOLERANCE:
-            return strength, precision
-        # Far from the maximum, a full Newton step may overshoot. Steps of one unit of log odds do not.
-        strength = strength + step / max(1.0, farthest)
-
-
-TOLERANCE = 1e-6
-"""Convergence of the fit, in log odds."""
 
 
 def _disjoint(value: Floats, first: NDArray[np.intp], second: NDArray[np.intp]) -> Iterator[int]:

@@ -14,9 +14,8 @@ actions. They count in no rating, payoff or verdict of the league, but stay view
 
 The first four parts are replaced together, each verdict and the results under earlier conditions separately, and only
 if they are stale. They are functions of the ledger alone. The process computes the snapshots of one league after the
-other, and keeps what it has read and drawn for the last ones (`league.results.sums.total`,
-`evaluation.statistics.bradley_terry`), so that new matches cost less than the results of all. It can be killed at any
-time. Several may run, one per league at a time.
+other, and keeps what it has read for the last ones (`league.results.sums.total`), so that new matches cost less than
+the results of all. It can be killed at any time. Several may run, one per league at a time.
 """
 
 from __future__ import annotations

@@ -1,70 +1,47 @@
 """Bradley–Terry ratings of all contestants from the blocks they played, with intervals.
 
 Contestant `i` scores against `j` with expectation `1 / (1 + 10^((r_j - r_i)/400))`; a draw counts as half a win for
-each. Ratings maximise the likelihood of all games plus a prior of **one virtual draw per pair that has played**. The
-rating of the anchor is 0 by definition. Intervals come from the Bayesian bootstrap over blocks and virtual draws, or,
-for very large tables, from the asymptotically equivalent sandwich estimator.
+each. Ratings maximise the likelihood of all games plus a prior of at most **one virtual draw per contestant**, divided
+among its opponents. They are differences to the anchor, and so are their intervals.
 
-The random weights of a pair depend on the pair and its blocks only, and are kept from one call to the next. After new
-blocks of one pair, those of the others are neither drawn again nor different.
+Intervals are normal, with the sandwich estimator of the variance: blocks are independent, their games are not. Pairs
+whose blocks say little about their variance borrow it from the model and from the other pairs. An undefeated contestant
+therefore has a wide interval, although its blocks do not vary.
 
 Sources: R. A. Bradley and M. E. Terry, "Rank analysis of incomplete block designs" (1952); D. R. Hunter, "MM
-algorithms for generalized Bradley–Terry models" (2004) for existence and connectedness; D. B. Rubin, "The
-Bayesian bootstrap" (1981); M. A. Newton and A. E. Raftery, "Approximate Bayesian inference with the weighted
-likelihood bootstrap" (1994); H. White, "Maximum likelihood estimation of misspecified models" (1982).
+algorithms for generalized Bradley–Terry models" (2004) for existence and connectedness; H. White, "Maximum likelihood
+estimation of misspecified models" (1982); P. McCullagh and J. Nelder, "Generalized linear models" (1989), 4.5, for the
+dispersion.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.special import expit, ndtri
 
 from evaluation.statistics.blas import single_threaded_blas
-from league.random.seeds import generator
 from league.results.records import Outcome
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 ELO = 400 / math.log(10)
 """Elo per unit of log odds."""
 
-TOLERANCE = 1e-3 / ELO
-"""A fit has converged when no rating moves by more than a thousandth of an Elo."""
+TOLERANCE = 1e-6
+"""Convergence of the fit, in log odds."""
 
-RESAMPLED = 0.5 / ELO
-"""The same for resamples. The next step would be PRECISE times as long, a hundredth of an Elo."""
+WIDE = 100.0
+"""Standard deviation of log odds without any game, which makes them finite for contestants that no game connects."""
 
-MOST_CELLS = 75_000_000
-"""Random numbers beyond which intervals come from the asymptotic distribution."""
-
-LONG = 0.5
-"""Log odds. Longer steps of Newton's method may overshoot."""
-
-PRECISE = 0.02
-"""Residual of a Newton step. Steps repeat until they are short, so this does not limit the precision."""
-
-MOST_DIRECTIONS = 100
-"""Conjugate gradient iterations per step. An inexact step still increases the likelihood."""
-
-TINY = 1e-300
-"""Smaller than any relevant curvature."""
-
-CELLS_AT_ONCE = 250_000
-"""Pairs times resamples that are fitted at once, so that they fit into caches."""
-
-KEPT_PAIRS = 4096
-"""Pairs whose random weights are kept: 32 MB with 1,000 resamples."""
+BORROWED = 2.0
+"""Information, in that of eight even games, with which a pair's own variance counts half."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,22 +53,13 @@ class Rating:
     high: float | None
 
 
-def rate(
-    results: Iterable[Outcome],
-    anchor: str,
-    *,
-    resamples: int = 1000,
-    confidence: float = 0.95,
-    seed: int = 0,
-) -> dict[str, Rating]:
+def rate(results: Iterable[Outcome], anchor: str, *, confidence: float = 0.95) -> dict[str, Rating]:
     """Rate all contestants in `results`. The result does not depend on their order.
 
     Args:
         results: Outcomes of matches (blocks), of two contestants each.
         anchor: Reference of the contestant whose rating is 0.
-        resamples: Resamples of the bootstrap.
         confidence: Coverage of the intervals.
-        seed: Seed of the bootstrap.
 
     Returns:
         Reference → rating in Elo, including the anchor.
@@ -99,224 +67,89 @@ def rate(
     blocks = list(results)
     names = sorted({anchor}.union(*(block.contestants for block in blocks)))
     number = {name: i for i, name in enumerate(names)}
-    table = _BlockTable.of(blocks, number)
-    first, second = table.pairs.T
-    graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(names), len(names)))
-    components = connected_components(graph, directed=False)[1]
-    rated = np.asarray(components == components[number[anchor]])
-    index = np.cumsum(rated) - 1
-    table = table.only(rated[table.pairs[:, 0]], index)
-    rated_names = tuple(itertools.compress(names, rated))
-    ratings = dict.fromkeys(names, Rating(None, None, None)) | {anchor: Rating(0.0, 0.0, 0.0)}
-    size, base = int(rated.sum()), int(index[number[anchor]])
-    if size > 1:
-        with single_threaded_blas():
-            fitted, low, high = _fitted(table, rated_names, base, resamples, (1 - confidence) / 2, seed)
-        for name in rated_names:
-            ratings[name] = Rating(*(float(ELO * x[index[number[name]]]) for x in (fitted, low, high)))
-    return ratings
-
-
-def _fitted(
-    table: _BlockTable, names: Sequence[str], base: int, resamples: int, tail: float, seed: int
-) -> tuple[Floats, Floats, Floats]:
-    """Log odds (size,) and the bounds of their intervals. names: of the contestants (size,)."""
-    points, games = table.sums()
-    fitted = _Model(table.pairs, len(names), base).fit(points[:, None], games[:, None])[:, 0]
-    if resamples * len(table.number) > MOST_CELLS:
-        half = float(ndtri(1 - tail)) * table.deviation(fitted, base)
-        return fitted, fitted - half, fitted + half
-    low, high = np.quantile(table.resampled(names, fitted, base, resamples, seed), (tail, 1 - tail), axis=1)
-    return fitted, low, high
+    sums = _Sums.of([block for block in blocks if len(set(block.contestants)) == 2], number)
+    base = number[anchor]
+    component = connected_components(sums.games, directed=False)[1]
+    with single_threaded_blas():
+        strength, deviation = sums.fit(base)
+    half = float(ndtri((1 + confidence) / 2)) * deviation
+    bounds = ELO * np.stack([strength, strength - half, strength + half], axis=1)
+    return {
+        name: Rating(*bounds[i].tolist()) if component[i] == component[base] else Rating(None, None, None)
+        for name, i in number.items()
+    }
 
 
 @dataclass(frozen=True, slots=True)
-class _BlockTable:
-    """Blocks counted by (pair, score, games). Row `k` stands for `number[k]` equal blocks of pair `pair[k]`."""
+class _Sums:
+    """Sums over the blocks of each pair, (n, n) each: points of the first, games, and products of these of a block."""
 
-    pairs: Ints  # (p, 2), first < second
-    pair: Ints  # (k,)
-    score: Floats  # (k,) of the first of the pair
-    games: Floats  # (k,)
-    number: Floats  # (k,)
+    points: Floats
+    games: Floats
+    squared_points: Floats
+    products: Floats
+    squared_games: Floats
 
     @classmethod
-    def of(cls, blocks: Sequence[Outcome], number: Mapping[str, int]) -> _BlockTable:
-        players = np.array([[number[name] for name in block.contestants] for block in blocks], dtype=np.int64)
-        players = players.reshape(-1, 2)
-        games = np.array([block.games for block in blocks], dtype=np.float64)
-        score = np.array([block.scores[0] for block in blocks], dtype=np.float64) / games
-        swapped = players[:, 0] > players[:, 1]
-        rows = np.column_stack([np.sort(players, axis=1), np.where(swapped, 1 - score, score), games])
-        rivals = players[:, 0] != players[:, 1]
-        cells, cell = np.unique(rows[rivals], axis=0, return_inverse=True)
-        matches = np.array([block.matches for block in blocks], dtype=np.float64)[rivals]
-        count = np.asarray(np.bincount(cell.reshape(-1), matches, minlength=len(cells)), dtype=np.float64)
-        pairs, pair = np.unique(cells[:, :2].astype(np.int64), axis=0, return_inverse=True)
-        return cls(pairs, pair.reshape(-1), cells[:, 2], cells[:, 3], count)
+    def of(cls, blocks: list[Outcome], number: dict[str, int]) -> _Sums:
+        players = np.array([[number[name] for name in block.contestants] for block in blocks], np.int64).reshape(-1, 2)
+        points = np.array([block.scores for block in blocks], np.float64).reshape(-1, 2)
+        games = np.array([block.games for block in blocks], np.float64)
+        matches = np.array([block.matches for block in blocks], np.float64)
+        sums = np.zeros((5, len(number), len(number)))
+        for side in (0, 1):
+            of_side = points[:, side]
+            terms = np.stack([of_side, games, of_side**2, of_side * games, games**2])
+            for into, term in zip(sums, terms, strict=True):
+                np.add.at(into, (players[:, side], players[:, 1 - side]), matches * term)
+        return cls(*sums)
 
-    def only(self, kept: NDArray[np.bool_], index: Ints) -> _BlockTable:
-        """The pairs `kept`, with contestants renumbered by `index`."""
-        rows = kept[self.pair]
-        renumbered = (np.cumsum(kept) - 1)[self.pair[rows]]
-        return _BlockTable(index[self.pairs[kept]], renumbered, self.score[rows], self.games[rows], self.number[rows])
-
-    def sums(self) -> tuple[Floats, Floats]:
-        """Points of the first of each pair, and games, each (p,), including the prior."""
-        games = np.add.reduceat(self.number * self.games, self._starts) + 1
-        points = np.add.reduceat(self.number * self.games * self.score, self._starts) + 0.5
-        return points, games
-
-    def resampled(self, names: Sequence[str], fitted: Floats, anchor: int, resamples: int, seed: int) -> Floats:
-        """Log odds (size, resamples) refitted under random weights, starting at `fitted` (size,)."""
-        rows = list(zip(self.score.tolist(), self.games.tolist(), self.number.tolist(), strict=True))
-        bounds = itertools.pairwise([*self._starts.tolist(), len(rows)])
-        sums = np.stack(
-            [
-                _random_sums((names[i], names[j]), tuple(rows[start:end]), resamples, seed)
-                for (i, j), (start, end) in zip(self.pairs.tolist(), bounds, strict=True)
-            ],
-            axis=1,
-        )
-        chunk = max(1, CELLS_AT_ONCE // len(self.pairs))
-        model = _Model(self.pairs, len(fitted), anchor, near=fitted, games=self.sums()[1])
-        parts = (sums[:, :, start : start + chunk].astype(np.float64) for start in range(0, resamples, chunk))
-        return np.concatenate([model.fit(points, games) for points, games in parts], axis=1)
-
-    @property
-    def _starts(self) -> NDArray[np.intp]:
-        """The first row of each pair (p,)."""
-        return np.flatnonzero(np.diff(self.pair, prepend=-1))
-
-    def deviation(self, fitted: Floats, anchor: int) -> Floats:
-        """Asymptotic standard deviation (size,) of the log odds under random weights.
-
-        The sandwich `H^-1 J H^-1` of the Hessian H and the sum J of squared gradients of blocks and virtual draws.
-        """
-        p = expit(fitted[self.pairs[:, 0]] - fitted[self.pairs[:, 1]])
-        surprise = self.number * (self.games * (self.score - p[self.pair])) ** 2
-        squares = np.add.reduceat(surprise, self._starts) + (0.5 - p) ** 2
-        design = _design(self.pairs, len(fitted))[:, np.arange(len(fitted)) != anchor]
-        inverse = cho_solve(_factor(design, self.sums()[1] * p * (1 - p)), np.eye(design.shape[1]))
-        variance = np.einsum("ij,ij->i", inverse @ _weighted(design, squares), inverse)
-        return np.insert(np.sqrt(variance), anchor, 0.0)
+    def fit(self, anchor: int) -> tuple[Floats, Floats]:
+        """Log odds (n,) above the anchor, and the standard deviations (n,) of these differences."""
+        strength, precision = posterior(self.points, self.games)
+        expected = expit(strength[:, None] - strength)
+        information = self.games * expected * (1 - expected)
+        squares = self.squared_points - 2 * expected * self.products + expected**2 * self.squared_games
+        dispersion = (squares.sum() / 2 + BORROWED) / (information.sum() / 2 + BORROWED)
+        variance = information * (squares + BORROWED * dispersion) / (information + BORROWED)
+        variance += virtual_draws(self.games) * expected * (1 - expected)
+        covariance = cho_solve(cho_factor(precision), np.eye(len(strength)))
+        sandwich = covariance @ (np.diag(variance.sum(axis=1)) - variance) @ covariance
+        of_gaps = np.diag(sandwich) + sandwich[anchor, anchor] - 2 * sandwich[anchor]
+        return strength - strength[anchor], np.sqrt(np.maximum(of_gaps, 0.0))
 
 
-@lru_cache(maxsize=KEPT_PAIRS)
-def _random_sums(
-    pair: tuple[str, str], rows: tuple[tuple[float, float, float], ...], resamples: int, seed: int
-) -> NDArray[np.float32]:
-    """Points of the first of a pair, and games, under random weights, (2, resamples), including the prior.
-
-    rows: scores, games and numbers of its blocks. `k` blocks of one kind together have a Gamma(k, 1) weight.
-    """
-    score, games, number = np.array(rows).T
-    random = generator(seed, *pair)
-    weight = random.standard_gamma(number[:, None], size=(len(number), resamples))
-    prior = np.multiply.outer([0.5, 1.0], random.standard_exponential(resamples))
-    return (np.stack([games * score, games]) @ weight + prior).astype(np.float32)
-
-
-def bradley_terry(points: Floats, games: Floats, pairs: Ints, size: int, anchor: int) -> Floats:
-    """Fit ratings to many weightings of the same pairs at once.
+def posterior(points: Floats, games: Floats) -> tuple[Floats, Floats]:
+    """Fit ratings to sums of games.
 
     Args:
-        points: Points of the first contestant of each pair, shape (resamples, p).
-        games: Games of each pair, shape (resamples, p).
-        pairs: Contestant numbers of each pair, int64 of shape (p, 2).
-        size: Number of contestants.
-        anchor: Number of the contestant whose log odds are 0.
+        points: `points[i, j]`: what i scored against j, shape (n, n).
+        games: Number of games of each pair, shape (n, n).
 
     Returns:
-        Maximum likelihood log odds, shape (resamples, size).
+        Maximum a posteriori log odds (n,), which add up to 0, and the precision (n, n) of the normal approximation.
     """
-    return _Model(pairs, size, anchor).fit(np.ascontiguousarray(points.T), np.ascontiguousarray(games.T)).T
+    draws = virtual_draws(games)
+    points, games = points + draws / 2, games + draws
+    strength = np.zeros(len(games))
+    while True:
+        expected = expit(strength[:, None] - strength)
+        information = games * expected * (1 - expected)
+        precision = np.diag(information.sum(axis=1) + WIDE**-2) - information
+        gradient = (points - games * expected).sum(axis=1) - strength / WIDE**2
+        step = cho_solve(cho_factor(precision), gradient)
+        farthest = np.abs(step).max()
+        if farthest < TOLERANCE:
+            return strength, precision
+        # Far from the maximum, a full Newton step may overshoot. Steps of one unit of log odds do not.
+        strength = strength + step / max(1.0, farthest)
 
 
-class _Model:
-    """Newton's method for many columns at once, each with its own points and games of the same pairs.
+def virtual_draws(games: Floats) -> Floats:
+    """The prior, as draws of each pair (n, n), in proportion to its games: at most one for each contestant.
 
-    Each step is solved by conjugate gradients with one preconditioner for all columns, so that one factorisation
-    suffices. By default it is the mean of their Hessians at each step; for one column, that is its Hessian.
-    near: log odds (size,) near all solutions, at which `games` (p,) define the preconditioner of all steps.
+    Draws with all opponents alike, or with the mean, would add up where many contestants have few neighbours each, as
+    versions of a run that met only their predecessors: the more versions, the closer together they would seem.
     """
-
-    def __init__(
-        self, pairs: Ints, size: int, anchor: int, near: Floats | None = None, games: Floats | None = None
-    ) -> None:
-        self._design, self._anchor = _design(pairs, size)[:, np.arange(size) != anchor], anchor
-        self._start = np.delete(np.zeros(size) if near is None else near - near[anchor], anchor)
-        self._factor, self._tolerance = None, TOLERANCE
-        if games is not None:
-            self._tolerance = RESAMPLED
-            p = expit(self._design @ self._start)
-            self._factor = _factor(self._design, games * p * (1 - p))
-
-    def fit(self, points: Floats, games: Floats) -> Floats:
-        """Maximum likelihood log odds (size, k) for points and games (p, k)."""
-        theta, columns = np.repeat(self._start[:, None], points.shape[1], axis=1), np.arange(points.shape[1])
-        while len(columns):
-            step = self._step(theta[:, columns], points, games)
-            theta[:, columns] += step
-            moving = np.abs(step).max(axis=0) > self._tolerance
-            if not moving.all():
-                columns, points, games = columns[moving], points[:, moving], games[:, moving]
-        return np.insert(theta, self._anchor, 0.0, axis=0)
-
-    def _step(self, theta: Floats, points: Floats, games: Floats) -> Floats:
-        """A step of each column. Long steps are halved until the concave likelihood does not decrease."""
-        gap = self._design @ theta
-        p = expit(gap)
-        expected = games * p
-        step = self._solve(expected * (1 - p), self._design.T @ (points - expected))
-        long = np.flatnonzero(np.abs(step).max(axis=0) > LONG)
-        if len(long):
-            points, games, gap, step_gap = points[:, long], games[:, long], gap[:, long], self._design @ step[:, long]
-            scale, floor = np.ones(len(long)), _likelihood(points, games, gap) - 1e-9
-            while (worse := _likelihood(points, games, gap + scale * step_gap) < floor).any():
-                scale[worse] /= 2
-            step[:, long] *= scale
-        return step
-
-    def _solve(self, information: Floats, gradient: Floats) -> Floats:
-        """Solve `design.T diag(information) design x = gradient` for each column of x (n, k), up to `PRECISE`.
-
-        Preconditioned conjugate gradients; J. Nocedal and S. Wright, "Numerical optimization" (2006), algorithm 5.3.
-        """
-        factor = self._factor or _factor(self._design, information.mean(axis=1))
-        x, residual = np.zeros_like(gradient), gradient
-        towards = solved = cho_solve(factor, residual, check_finite=False)
-        squared_norm = (residual * solved).sum(axis=0)
-        enough = PRECISE**2 * squared_norm
-        for _ in range(MOST_DIRECTIONS):
-            if not (squared_norm > enough).any():
-                break
-            curved = self._design.T @ (information * (self._design @ towards))
-            # A converged column has a residual of zero.
-            length = squared_norm / np.maximum((towards * curved).sum(axis=0), TINY)
-            x, residual = x + length * towards, residual - length * curved
-            solved = cho_solve(factor, residual, check_finite=False)
-            before, squared_norm = squared_norm, (residual * solved).sum(axis=0)
-            towards = solved + (squared_norm / np.maximum(before, TINY)) * towards
-        return x
-
-
-def _design(pairs: Ints, size: int) -> csr_array:
-    """The matrix (p, size) that maps log odds to the difference of each pair."""
-    rows = np.tile(np.arange(len(pairs)), 2)
-    return csr_array((np.repeat([1.0, -1.0], len(pairs)), (rows, pairs.T.reshape(-1))), shape=(len(pairs), size))
-
-
-def _factor(design: csr_array, information: Floats) -> tuple[Floats, bool]:
-    """Factorised Hessian for pairs with this `information` (p,)."""
-    factor: tuple[Floats, bool] = cho_factor(_weighted(design, information), check_finite=False)
-    return factor
-
-
-def _weighted(design: csr_array, weight: Floats) -> Floats:
-    """`design.T diag(weight) design`"""
-    return np.asarray((design.T @ design.multiply(weight[:, None])).toarray())
-
-
-def _likelihood(points: Floats, games: Floats, gap: Floats) -> Floats:
-    return np.asarray((points * gap - games * np.logaddexp(0.0, gap)).sum(axis=0))
+    share = games / np.maximum(games.sum(axis=1, keepdims=True), 1.0)
+    return np.minimum(share, share.T)

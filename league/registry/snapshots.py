@@ -21,8 +21,8 @@ from league.registry.verdicts import VOID
 
 SUMMARY = "summary"
 """The part that has a league's newest mark when all parts are up to date."""
-FORMAT = 1
-"""Version of the document format. A new format invalidates all snapshots."""
+FORMAT = 2
+"""Version of the documents and of how their numbers are computed. A new one invalidates all snapshots."""
 
 
 def earlier_part(conditions: str, part: str) -> str:

@@ -1,15 +1,18 @@
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+from random import Random
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.statistics.bradley_terry import ELO, Rating, bradley_terry, rate
+from evaluation.statistics.bradley_terry import ELO, Rating, posterior, rate, virtual_draws
 from evaluation.statistics.sequential import score_of
 from league.results.records import Outcome
 from tests.support.closeness import close
+from tests.support.examples import examples
 
 RANDOM = "script:random"
 
@@ -37,9 +40,22 @@ def block(first: str, second: str, score: float, games: int = 2) -> Outcome:
 
 
 def fitted(games: dict[tuple[int, int], tuple[float, float]], size: int) -> np.ndarray:
-    pairs = np.array(list(games))
-    points, played = np.array(list(games.values()), dtype=float).T
-    return bradley_terry(points[None], played[None], pairs, size, anchor=0)[0]
+    """Log odds from so many games that the prior does not matter. games: pair → score of the first, games."""
+    points, played = np.zeros((2, size, size))
+    for (i, j), (score, number) in games.items():
+        points[i, j], points[j, i] = 1e6 * score, 1e6 * (number - score)
+        played[i, j] = played[j, i] = 1e6 * number
+    return posterior(points, played)[0]
+
+
+def expected(elos: Sequence[float], pairs: Iterable[tuple[int, int]], matches: int) -> list[Outcome]:
+    """Matches of two games whose scores are the expected ones. Contestant 0 is `script:random`."""
+    names = [RANDOM, *(f"league@{i}" for i in range(1, len(elos)))]
+    return [
+        Outcome((names[i], names[j]), 2, (2 * score, 2 - 2 * score), matches)
+        for i, j in pairs
+        if (score := float(score_of(elos[i] - elos[j])))
+    ]
 
 
 def simulated(
@@ -68,7 +84,7 @@ def test_the_order_equals_that_of_openspiel() -> None:
 
 
 def test_two_contestants_in_closed_form() -> None:
-    """15 of 20 points and the prior's virtual draw: 15.5 of 21."""
+    """15 of 20 points and the virtual draw: 15.5 of 21."""
     ratings = rate([block("league@1", RANDOM, 0.75)] * 10, RANDOM)
     assert ratings["league@1"].elo == pytest.approx(400 * math.log10(15.5 / 5.5), abs=0.01)
 
@@ -107,72 +123,90 @@ def test_blocks_against_oneself_are_ignored() -> None:
     assert close(rate([*blocks, *[block("league@1", "league@1", 0.5)] * 5], RANDOM), rate(blocks, RANDOM))
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(st.randoms(use_true_random=False))
-def test_ratings_do_not_depend_on_the_order_of_blocks(random: object) -> None:
+def test_ratings_do_not_depend_on_the_order_of_blocks(random: Random) -> None:
     blocks = simulated([0, 50, 120, 90], 10, np.random.default_rng(3))
     shuffled = list(blocks)
-    random.shuffle(shuffled)  # type: ignore[attr-defined]
+    random.shuffle(shuffled)
     reversed_blocks = [Outcome(b.contestants[::-1], b.games, b.scores[::-1]) for b in shuffled]
-    assert close(rate(reversed_blocks, RANDOM, resamples=50), rate(blocks, RANDOM, resamples=50))
+    assert close(rate(reversed_blocks, RANDOM), rate(blocks, RANDOM))
 
 
-def test_the_seed_affects_the_interval_only() -> None:
-    blocks = simulated([0, 50], 20, np.random.default_rng(4))
-    one, two = (rate(blocks, RANDOM, seed=seed)["league@1"] for seed in (1, 2))
-    assert one.elo == pytest.approx(two.elo)
-    assert one != two
+def test_equal_matches_may_be_summed_up() -> None:
+    blocks = [*[block("league@1", RANDOM, 0.75)] * 10, *[block("league@1", RANDOM, 0.5)] * 5]
+    summed = [
+        Outcome(one.contestants, one.games, one.scores, number) for one, number in ((blocks[0], 10), (blocks[-1], 5))
+    ]
+    assert close(rate(summed, RANDOM), rate(blocks, RANDOM))
 
 
-def test_resamples_fitted_together_equal_those_fitted_separately() -> None:
-    rng = np.random.default_rng(5)
-    pairs = np.array([(i, j) for i in range(8) for j in range(i + 1, 8)])
-    games = rng.gamma(5, size=(60, len(pairs)))
-    points = games * rng.beta(0.4, 0.4, size=games.shape)
-    together = bradley_terry(points, games, pairs, 8, anchor=2)
-    alone = [bradley_terry(points[i : i + 1], games[i : i + 1], pairs, 8, anchor=2)[0] for i in range(60)]
-    assert np.abs(together - alone).max() * ELO < 0.01
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.integers(1, 10_000)), min_size=1))
+def test_the_prior_is_at_most_one_game_of_each_contestant(played: list[tuple[int, int, int]]) -> None:
+    games = np.zeros((10, 10))
+    for i, j, number in played:
+        if i != j:
+            games[i, j] += number
+            games[j, i] += number
+    draws = virtual_draws(games)
+    assert close(draws, draws.T)
+    assert (draws.sum(axis=1) <= 1 + 1e-9).all()
+    assert ((draws > 0) == (games > 0)).all()
 
 
-def test_resamples_of_few_and_lopsided_blocks_converge() -> None:
-    """At the solution the gradient is zero, even far from the initial values."""
-    rng = np.random.default_rng(8)
-    pairs = np.array([(i, j) for i in range(30) for j in range(i + 1, min(30, i + 3))])
-    games = rng.gamma(0.3, size=(200, len(pairs))) + 0.05
-    points = games * rng.beta(0.1, 0.1, size=games.shape).clip(0.01, 0.99)
-    theta = bradley_terry(points, games, pairs, 30, anchor=3)
-    gap = theta[:, pairs[:, 0]] - theta[:, pairs[:, 1]]
-    left = points - games / (1 + np.exp(-gap))
-    gradient = np.zeros_like(theta)
-    np.add.at(gradient.T, pairs[:, 0], left.T)
-    np.subtract.at(gradient.T, pairs[:, 1], left.T)
-    assert np.abs(np.delete(gradient, 3, axis=1)).max() < 1e-4
-    assert close(theta[:, 3], np.zeros(len(theta)))
+@pytest.mark.parametrize(("size", "spread"), [(8, 1200), (20, 1500), (60, 1500)])
+def test_the_best_of_a_ladder_is_not_too_close_to_the_others(size: int, spread: float) -> None:
+    """From the expected scores of 16 matches a pair. One virtual draw per pair would cost 240 Elo."""
+    elos = np.linspace(0, spread, size)
+    best = rate(expected(elos, combinations(range(size), 2), 16), RANDOM)[f"league@{size - 1}"].elo
+    assert best == pytest.approx(spread, abs=30)
 
 
-def test_intervals_of_large_tables_approximate_the_bootstrap(monkeypatch: pytest.MonkeyPatch) -> None:
-    blocks = simulated([10.0 * i for i in range(60)], 4, np.random.default_rng(9))
-    refitted = rate(blocks, RANDOM)
-    monkeypatch.setattr("evaluation.statistics.bradley_terry.MOST_CELLS", 0)
-    at_once = rate(blocks, RANDOM)
-    bounds = np.array([[(r.low, r.high) for r in each.values() if r.elo] for each in (refitted, at_once)], dtype=float)
-    assert bounds.shape == (2, 59, 2)
-    off = np.abs(bounds[0] - bounds[1]) / np.diff(bounds[0], axis=1)
-    assert off.mean() < 0.03
-    assert off.max() < 0.1
-    assert close([r.elo for r in at_once.values()], [r.elo for r in refitted.values()])
-    assert close((at_once[RANDOM].low, at_once[RANDOM].high), (0.0, 0.0))
+def test_versions_that_met_only_their_predecessors_keep_their_distances() -> None:
+    """N(0, (600 Elo)²) of each contestant: 150 Elo too close."""
+    elos, pairs = np.linspace(0, 1500, 60), [(max(0, i - k), i) for i in range(1, 60) for k in (1, 2, 3) if k <= i]
+    best = rate(expected(elos, pairs, 16), RANDOM)["league@59"].elo
+    assert best == pytest.approx(1500, abs=20)
 
 
-def test_intervals_have_their_coverage() -> None:
-    """95 % intervals of 3 contestants, 200 blocks per pair, in 150 leagues, with binomial error."""
-    rng, truth = np.random.default_rng(6), [0.0, 60.0, 150.0]
-    hits = 0
-    for _ in range(150):
-        ratings = rate(simulated(truth, 200, rng), RANDOM, resamples=400)
-        for name, elo in (("league@1", truth[1]), ("league@2", truth[2])):
-            low, high = ratings[name].low, ratings[name].high
-            assert low is not None
-            assert high is not None
-            hits += low <= elo <= high
-    assert 0.91 <= hits / 300 <= 0.985
+def test_the_interval_is_that_of_the_mean_score() -> None:
+    """Of one pair with many blocks, by the delta method: the deviation of a block's points over their slope."""
+    blocks = [*[block("league@1", RANDOM, 1.0)] * 300, *[block("league@1", RANDOM, 0.5)] * 700]
+    rating = rate(blocks, RANDOM)["league@1"]
+    assert rating.elo is not None
+    assert rating.high is not None
+    score, variance = 0.65, 0.3 * 0.7 / 4
+    assert rating.high - rating.elo == pytest.approx(
+        1.96 * ELO * math.sqrt(variance / 1000) / (score * (1 - score)), rel=0.02
+    )
+
+
+def test_an_interval_of_few_equal_blocks_is_almost_that_of_the_model() -> None:
+    """Two drawn matches do not vary, which does not show that others would not."""
+    rating = rate([block("league@1", RANDOM, 0.5)] * 2, RANDOM)["league@1"]
+    assert rating.high is not None
+    of_model = 1.96 * ELO / math.sqrt(4 * 0.25)
+    assert 0.6 * of_model < rating.high < of_model
+
+
+def test_an_advantage_of_a_side_narrows_intervals() -> None:
+    """If the first move wins, all blocks are 1:1, and say more about the difference than decisive games."""
+    pairs = [("league@1", RANDOM), ("league@2", RANDOM), ("league@1", "league@2")]
+    even = [block(*pair, 0.5) for pair in pairs for _ in range(50)]
+    decisive = [block(*pair, score) for pair in pairs for score in (0.0, 1.0) for _ in range(25)]
+    widths = [r.high - r.low for r in (rate(blocks, RANDOM)["league@1"] for blocks in (even, decisive))]  # type: ignore[operator]
+    assert widths[0] < 0.5 * widths[1]
+
+
+@pytest.mark.parametrize(("elos", "blocks"), [((0, 60, 150), 200), (tuple(np.linspace(0, 1500, 20)), 16)])
+def test_intervals_have_their_coverage(elos: Sequence[float], blocks: int) -> None:
+    """95 % intervals of 150 leagues, with binomial error."""
+    rng, hits, number = np.random.default_rng(6), 0, 150
+    for _ in range(number):
+        ratings = rate(simulated(elos, blocks, rng), RANDOM)
+        for i, elo in enumerate(elos[1:], start=1):
+            rating = ratings[f"league@{i}"]
+            assert rating.low is not None
+            assert rating.high is not None
+            hits += rating.low <= elo <= rating.high
+    assert 0.92 <= hits / (number * (len(elos) - 1)) <= 0.98
