@@ -93,13 +93,10 @@ def _results(ladder: Ladder, names: list[str], rng: np.random.Generator) -> list
     else:
         pairs = _pairs(ladder)
         numbers = rng.multinomial(ladder.blocks, _shares(ladder, pairs))
-        played = Counter(
-            {
-                (pair, float(points)): int(number)
-                for pair, row in zip(pairs, numbers, strict=True)
-                for points, number in zip(POINTS, row, strict=True)
-            }
-        )
+        played = Counter[tuple[Pair, float]]()
+        for pair, row in zip(pairs, numbers.tolist(), strict=True):
+            for points, number in zip(POINTS.tolist(), row, strict=True):
+                played[pair, points] += number
     return [
         Outcome((names[i], names[j]), GAMES_PER_BLOCK, (points, GAMES_PER_BLOCK - points), number)
         for ((i, j), points), number in played.items()
