@@ -122,7 +122,7 @@ def _shares(ladder: Ladder, pairs: list[Pair]) -> Floats:
 
 
 def _adaptive(ladder: Ladder, rng: np.random.Generator) -> Counter[tuple[Pair, float]]:
-    """An adaptive tournament of the default length."""
+    """An adaptive tournament with a quarter of the matches of the round robin, as by default."""
     size = len(ladder.elos)
     played, number = Counter[tuple[Pair, float]](), 0
     points, games = np.zeros((2, size, size))

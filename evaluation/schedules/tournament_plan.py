@@ -147,7 +147,7 @@ class Budget:
 UNLIMITED = Budget()
 
 LEAST = 20
-"""Minimum matches per contestant before its interval counts: a few equal results would give a width of zero."""
+"""Minimum matches per contestant before its interval counts: from a few, it is rough."""
 
 
 class StoppingRule:

@@ -35,7 +35,10 @@ ELO = 400 / math.log(10)
 """Elo per unit of log odds."""
 
 TOLERANCE = 1e-6
-"""Convergence of the fit, in log odds."""
+"""A fit has converged when no difference of two log odds moves by more."""
+
+MOST_STEPS = 1000
+"""Steps of a fit: rounding of many millions of games may keep the last ones from vanishing."""
 
 WIDE = 100.0
 """Standard deviation of log odds without any game, which makes them finite for contestants that no game connects."""
@@ -67,56 +70,47 @@ def rate(results: Iterable[Outcome], anchor: str, *, confidence: float = 0.95) -
     blocks = list(results)
     names = sorted({anchor}.union(*(block.contestants for block in blocks)))
     number = {name: i for i, name in enumerate(names)}
-    sums = _Sums.of([block for block in blocks if len(set(block.contestants)) == 2], number)
-    base = number[anchor]
-    component = connected_components(sums.games, directed=False)[1]
+    sums = _sums([block for block in blocks if len(set(block.contestants)) == 2], number)
+    component = connected_components(sums[1], directed=False)[1]
+    rated = np.flatnonzero(component == component[number[anchor]])
     with single_threaded_blas():
-        strength, deviation = sums.fit(base)
+        strength, deviation = _fitted(sums[:, rated][:, :, rated], int(np.searchsorted(rated, number[anchor])))
     half = float(ndtri((1 + confidence) / 2)) * deviation
     bounds = ELO * np.stack([strength, strength - half, strength + half], axis=1)
-    return {
-        name: Rating(*bounds[i].tolist()) if component[i] == component[base] else Rating(None, None, None)
-        for name, i in number.items()
-    }
+    ratings = dict.fromkeys(names, Rating(None, None, None))
+    return ratings | {names[i]: Rating(*row) for i, row in zip(rated, bounds.tolist(), strict=True)}
 
 
-@dataclass(frozen=True, slots=True)
-class _Sums:
-    """Sums over the blocks of each pair, (n, n) each: points of the first, games, and products of these of a block."""
+def _sums(blocks: list[Outcome], number: dict[str, int]) -> Floats:
+    """Sums over the blocks of i against j, (5, n, n): i's points, games, squared points, points × games, squared games.
 
-    points: Floats
-    games: Floats
-    squared_points: Floats
-    products: Floats
-    squared_games: Floats
+    number: contestant → index.
+    """
+    players = np.array([[number[name] for name in block.contestants] for block in blocks], np.int64).reshape(-1, 2)
+    scores = np.array([block.scores for block in blocks], np.float64).reshape(-1, 2)
+    games = np.array([block.games for block in blocks], np.float64)
+    matches = np.array([block.matches for block in blocks], np.float64)
+    sums = np.zeros((5, len(number), len(number)))
+    for side, points in enumerate(scores.T):
+        for total, term in zip(sums, (points, games, points**2, points * games, games**2), strict=True):
+            np.add.at(total, (players[:, side], players[:, 1 - side]), matches * term)
+    return sums
 
-    @classmethod
-    def of(cls, blocks: list[Outcome], number: dict[str, int]) -> _Sums:
-        players = np.array([[number[name] for name in block.contestants] for block in blocks], np.int64).reshape(-1, 2)
-        points = np.array([block.scores for block in blocks], np.float64).reshape(-1, 2)
-        games = np.array([block.games for block in blocks], np.float64)
-        matches = np.array([block.matches for block in blocks], np.float64)
-        sums = np.zeros((5, len(number), len(number)))
-        for side in (0, 1):
-            of_side = points[:, side]
-            terms = np.stack([of_side, games, of_side**2, of_side * games, games**2])
-            for into, term in zip(sums, terms, strict=True):
-                np.add.at(into, (players[:, side], players[:, 1 - side]), matches * term)
-        return cls(*sums)
 
-    def fit(self, anchor: int) -> tuple[Floats, Floats]:
-        """Log odds (n,) above the anchor, and the standard deviations (n,) of these differences."""
-        strength, precision = posterior(self.points, self.games)
-        expected = expit(strength[:, None] - strength)
-        information = self.games * expected * (1 - expected)
-        squares = self.squared_points - 2 * expected * self.products + expected**2 * self.squared_games
-        dispersion = (squares.sum() / 2 + BORROWED) / (information.sum() / 2 + BORROWED)
-        variance = information * (squares + BORROWED * dispersion) / (information + BORROWED)
-        variance += virtual_draws(self.games) * expected * (1 - expected)
-        covariance = cho_solve(cho_factor(precision), np.eye(len(strength)))
-        sandwich = covariance @ (np.diag(variance.sum(axis=1)) - variance) @ covariance
-        of_gaps = np.diag(sandwich) + sandwich[anchor, anchor] - 2 * sandwich[anchor]
-        return strength - strength[anchor], np.sqrt(np.maximum(of_gaps, 0.0))
+def _fitted(sums: Floats, anchor: int) -> tuple[Floats, Floats]:
+    """Log odds (n,) above the anchor, and the standard deviations (n,) of these differences."""
+    points, games, squared_points, products, squared_games = sums
+    strength, precision = posterior(points, games)
+    expected = expit(strength[:, None] - strength)
+    information = games * expected * (1 - expected)
+    squares = squared_points - 2 * expected * products + expected**2 * squared_games
+    dispersion = (squares.sum() / 2 + BORROWED) / (information.sum() / 2 + BORROWED)
+    variance = information * (squares + BORROWED * dispersion) / (information + BORROWED)
+    variance += virtual_draws(games) * expected * (1 - expected)
+    covariance = cho_solve(cho_factor(precision), np.eye(len(strength)))
+    sandwich = covariance @ (np.diag(variance.sum(axis=1)) - variance) @ covariance
+    of_gaps = np.diag(sandwich) + sandwich[anchor, anchor] - 2 * sandwich[anchor]
+    return strength - strength[anchor], np.sqrt(np.maximum(of_gaps, 0.0))
 
 
 def posterior(points: Floats, games: Floats) -> tuple[Floats, Floats]:
@@ -132,24 +126,27 @@ def posterior(points: Floats, games: Floats) -> tuple[Floats, Floats]:
     draws = virtual_draws(games)
     points, games = points + draws / 2, games + draws
     strength = np.zeros(len(games))
-    while True:
+    for _ in range(MOST_STEPS):
         expected = expit(strength[:, None] - strength)
         information = games * expected * (1 - expected)
         precision = np.diag(information.sum(axis=1) + WIDE**-2) - information
         gradient = (points - games * expected).sum(axis=1) - strength / WIDE**2
         step = cho_solve(cho_factor(precision), gradient)
-        farthest = np.abs(step).max()
-        if farthest < TOLERANCE:
-            return strength, precision
-        # Far from the maximum, a full Newton step may overshoot. Steps of one unit of log odds do not.
-        strength = strength + step / max(1.0, farthest)
+        change = np.ptp(step)
+        if change < TOLERANCE:
+            break
+        # Far from the maximum, a full Newton step may overshoot. The likelihood increases if no difference changes by
+        # more than one unit of log odds.
+        strength = strength + step / max(1.0, change)
+    return strength, precision
 
 
 def virtual_draws(games: Floats) -> Floats:
     """The prior, as draws of each pair (n, n), in proportion to its games: at most one for each contestant.
 
-    Draws with all opponents alike, or with the mean, would add up where many contestants have few neighbours each, as
-    versions of a run that met only their predecessors: the more versions, the closer together they would seem.
+    The smaller share counts: a contestant that all others met, such as the anchor, would get more than one otherwise. A
+    prior that draws all towards one value would add up along versions that met only their predecessors: the more of
+    them, the closer together they would seem.
     """
     share = games / np.maximum(games.sum(axis=1, keepdims=True), 1.0)
     return np.minimum(share, share.T)

@@ -51,11 +51,8 @@ def fitted(games: dict[tuple[int, int], tuple[float, float]], size: int) -> np.n
 def expected(elos: Sequence[float], pairs: Iterable[tuple[int, int]], matches: int) -> list[Outcome]:
     """Matches of two games whose scores are the expected ones. Contestant 0 is `script:random`."""
     names = [RANDOM, *(f"league@{i}" for i in range(1, len(elos)))]
-    return [
-        Outcome((names[i], names[j]), 2, (2 * score, 2 - 2 * score), matches)
-        for i, j in pairs
-        if (score := float(score_of(elos[i] - elos[j])))
-    ]
+    scores = {(i, j): float(score_of(elos[i] - elos[j])) for i, j in pairs}
+    return [Outcome((names[i], names[j]), 2, (2 * x, 2 - 2 * x), matches) for (i, j), x in scores.items()]
 
 
 def simulated(
@@ -139,6 +136,28 @@ def test_equal_matches_may_be_summed_up() -> None:
         Outcome(one.contestants, one.games, one.scores, number) for one, number in ((blocks[0], 10), (blocks[-1], 5))
     ]
     assert close(rate(summed, RANDOM), rate(blocks, RANDOM))
+
+
+@pytest.mark.parametrize("matches", [10**number for number in range(4, 12)])
+def test_a_fit_of_many_games_ends(matches: int) -> None:
+    """Rounding does not keep it from converging, nor do games of others that no chain connects to the anchor."""
+    elos = [0.0, 500.0, 1000.0]
+    others = [Outcome(("league@8", "league@9"), 2, (2.0, 0.0), matches), block("league@8", "league@9", 0.0)]
+    ratings = rate([*expected(elos, combinations(range(3), 2), matches), *others], RANDOM)
+    assert [ratings[f"league@{i}"].elo for i in (1, 2)] == pytest.approx(elos[1:], abs=0.5)
+    assert ratings["league@9"].elo is None
+
+
+@given(st.integers(0, 10_000))
+def test_few_and_lopsided_games_are_fitted(seed: int) -> None:
+    """At the solution the gradient is zero, even far from the initial values."""
+    rng = np.random.default_rng(seed)
+    games = np.triu(rng.gamma(0.3, size=(30, 30)) + 0.05, 1) * (rng.random((30, 30)) < 0.2)
+    points = games * rng.beta(0.1, 0.1, size=games.shape)
+    points, games = points + (games - points).T, games + games.T
+    strength, draws = posterior(points, games)[0], virtual_draws(games)
+    scored = 1 / (1 + np.exp(strength - strength[:, None]))
+    assert np.abs((points + draws / 2 - (games + draws) * scored).sum(axis=1)).max() < 0.02
 
 
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.integers(1, 10_000)), min_size=1))
