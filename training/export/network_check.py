@@ -22,7 +22,7 @@ from league.random.seeds import derive, generator
 from league.spaces import ACTION_MASK
 from training.algorithms.rllib_config import module_spec
 from training.export.onnx_export import onnx_program
-from training.export.parity import TOLERANCE, ObservedBatch, PlayLimits, observed_play
+from training.export.parity import TOLERANCE, ObservedBatch, PlayLimits, influence, observed_play
 from training.modules.own_network import NETWORK, OwnNetwork
 from training.sampling.distributions import distribution
 from training.sampling.env_runner import one_thread
@@ -152,9 +152,11 @@ def _unsupported_line(program: torch.export.ExportedProgram, causes: Sequence[Ba
 
 
 def _difference(graph: bytes, network: OwnNetwork, inputs: dict[str, NDArray]) -> str | None:
-    """Return how the features of a graph differ from those of its network; None if they agree."""
+    """Return how the features of a graph differ from those of its network, or depend on more than the observation; None
+    if neither is so.
+    """
     session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
-    names = [node.name for node in session.get_inputs()]
+    names, largest = [node.name for node in session.get_inputs()], 0.0
     for rows in (1, len(next(iter(inputs.values())))):
         batch = {name: array[:rows] for name, array in inputs.items()}
         with torch.no_grad():
@@ -163,13 +165,14 @@ def _difference(graph: bytes, network: OwnNetwork, inputs: dict[str, NDArray]) -
             (features,) = session.run(None, {name: batch[name] for name in names})
         except Exception as error:
             return f"has an ONNX graph that fails for a batch of {rows}: {one_line(error, first_line=True)}"
-        difference = float((np.abs(features - expected) / (1 + np.abs(expected))).max(initial=0.0))
-        if not difference <= TOLERANCE:
-            return (
-                f"differs from its ONNX graph by up to {difference:g}, relative to 1 + |x|, in a feature: features must"
-                " be computed by torch, from the observations alone"
-            )
-    return None
+        largest = max(largest, float((np.abs(features - expected) / (1 + np.abs(expected))).max(initial=0.0)))
+    problem = influence(lambda arrays: session.run(None, {name: arrays[name] for name in names}), inputs)
+    if problem is None and not largest <= TOLERANCE:
+        problem = (
+            f"differs from its ONNX graph by up to {largest:g}, relative to 1 + |x|, in a feature: features must be"
+            " computed by torch, from the observations alone"
+        )
+    return problem
 
 
 @contextmanager

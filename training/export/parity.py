@@ -1,9 +1,9 @@
-"""Checks that an exported graph acts as the trained module, on observations from play."""
+"""Checks on observations from play: a graph acts as the trained module, and on each observation by itself."""
 
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from ray.rllib.core.columns import Columns
 from league.config.environment import EnvironmentConfig
 from league.environments.lockstep import stock_stepping
 from league.environments.stepping import Batch, Indices, Starts
-from league.errors import ParityError
+from league.errors import ObservationError, ParityError, one_line
 from league.interface import Interface
 from league.policies.actions import to_environment
 from league.policies.graph_runs import open_session
@@ -42,6 +42,10 @@ TOLERANCE = 1e-3
 """Maximum difference of distribution inputs and states, relative to 1 + |x|: above it, exploration would differ."""
 PROBES, MAX_PROBE_BYTES = 32, 2**20
 """Probes recorded per policy; fewer if their observations exceed this size."""
+ROWS, MAX_ROW_BYTES = 256, 32 * 2**20
+"""Observations on which `check_rows` runs a graph, likewise."""
+
+BY_CHANCE = "as with Dropout or BatchNorm in training mode: export the network in evaluation mode"
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,9 +262,12 @@ def check_value(
 ) -> None:
     """Compare the value graph at `path` with `module`, whose values have the units `scale`.
 
-    Raises ParityError if a distribution input or a value differs by more than TOLERANCE.
+    Raises ParityError if a distribution input or a value differs by more than TOLERANCE, or depends on more than the
+    observation.
     """
     session, worst = open_session(path.read_bytes()), 0.0
+    if problem := influence(lambda arrays: session.run(None, arrays), _sampled(batches, ROWS, MAX_ROW_BYTES)[0]):
+        raise ParityError(f"the value graph of policy {policy} {problem}")
     for batch in batches:
         observations = {name: torch.from_numpy(array) for name, array in batch.observations.items()}
         with torch.no_grad():
@@ -275,18 +282,89 @@ def check_value(
         )
 
 
+@one_thread()
+def check_rows(policy: str, graph: OnnxPolicy, batches: list[ObservedBatch], space: Space) -> None:
+    """Raise ParityError if what a graph computes for an observation depends on anything else.
+
+    It would play one game in the batches of a match and another alone. A comparison with its source does not show this,
+    since the source has the same defect. space: of the actions.
+    """
+    observations, state = _sampled(batches, ROWS, MAX_ROW_BYTES)
+
+    def run(arrays: Mapping[str, NDArray]) -> list[NDArray]:
+        answer = graph.outputs(arrays, state={name: arrays[name] for name in state} or None)
+        assert answer.dist_inputs is not None
+        # The previous action in a state is the greedy one.
+        after = [array for name, array in (answer.state or {}).items() if name != LAST_ACTION]
+        return [answer.actions, answer.dist_inputs, *after]
+
+    if problem := influence(run, observations | state, space):
+        raise ParityError(f"the graph of policy {policy} {problem}")
+
+
+def influence(
+    run: Callable[[Mapping[str, NDArray]], Sequence[NDArray]], arrays: Mapping[str, NDArray], space: Space | None = None
+) -> str | None:
+    """Return how other rows or chance influence the outputs of a graph for a row, a predicate; None if they do not.
+
+    A batch is run, run again, in another order, and row by row. Outputs differ if they do by more than TOLERANCE, and
+    greedy actions if they do other than in near ties.
+
+    Args:
+        run: Inputs of the graph, each (k, …) → outputs, each (k, …).
+        arrays: Inputs for k rows.
+        space: Of the actions, if the first outputs are greedy actions and distribution inputs.
+    """
+    rows = len(next(iter(arrays.values())))
+    backwards = np.arange(rows)[::-1]
+    together, again = run(arrays), run(arrays)
+    reversed_rows = run({name: array[backwards] for name, array in arrays.items()})
+    try:
+        single = [run({name: array[row : row + 1] for name, array in arrays.items()}) for row in range(rows)]
+        alone = [np.concatenate(outputs) for outputs in zip(*single, strict=True)]
+        if shapes := [output.shape for output in alone if len(output) != rows]:
+            raise ValueError(f"{rows} single runs have an output of the shape {list(shapes[0])}")
+    except (ObservationError, ValueError) as error:
+        return f"fails on a single observation: {one_line(error)}"
+    cause = (
+        "its rows influence each other, as with a softmax or statistics over axis 0, or with attention or recurrence"
+        " that take axis 0 for time (batch_first)"
+    )
+    for outputs, where, reason in (
+        (again, "in a second run", BY_CHANCE),
+        (alone, "alone than in a batch", cause),
+        ([output[backwards] for output in reversed_rows], "in another order", cause),
+    ):
+        differs = np.zeros(rows, bool)
+        for number, (output, expected) in enumerate(zip(outputs, together, strict=True)):
+            if space is not None and number == 0:
+                differs |= ~excused(output, expected, together[1], space)
+            else:
+                close = np.isclose(output, expected, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True)
+                differs |= ~close.reshape(rows, -1).all(axis=1)
+        if differs.any():
+            return f"computes other outputs for {differs.sum()} of {rows} observations {where}: {reason}"
+    return None
+
+
 def probes(graph: OnnxPolicy, batches: list[ObservedBatch]) -> Probes:
     """Return evenly spaced observations with the actions of a graph."""
+    observations, state = _sampled(batches, PROBES, MAX_PROBE_BYTES)
+    return Probes(observations, state, graph.act(observations, state=state or None).actions)
+
+
+def _sampled(batches: list[ObservedBatch], most: int, most_bytes: int) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+    """Return evenly spaced observations, and the graph's states before them."""
     starts = np.cumsum([0, *map(len, batches)])
     size = sum(array[0].nbytes for array in batches[0].observations.values())
-    count = min(PROBES, max(1, MAX_PROBE_BYTES // size), int(starts[-1]))
+    count = min(most, max(1, most_bytes // size), int(starts[-1]))
     rows = np.linspace(0, starts[-1] - 1, count).astype(int)
     samples = [(batches[i], row - starts[i]) for row in rows for i in [int(np.searchsorted(starts, row, "right")) - 1]]
     observations = {
         name: np.stack([batch.observations[name][row] for batch, row in samples]) for name in batches[0].observations
     }
-    state = _state_in({key: np.stack([batch.state[key][row] for batch, row in samples]) for key in batches[0].state})
-    return Probes(observations, state, graph.act(observations, state=state or None).actions)
+    state = {key: np.stack([batch.state[key][row] for batch, row in samples]) for key in batches[0].state}
+    return observations, _state_in(state)
 
 
 def _state_in(state: Mapping[str, NDArray]) -> dict[str, NDArray]:

@@ -101,8 +101,10 @@ def export(
         value = None if critic is None else f"{policy}{VALUE}"
         export_policy(module, spaces, directory / file, None if value is None else directory / value, scale)
         inputs, outputs, state = graph_tensors(module, spaces)
+        graph = OnnxPolicy(directory / file)
+        parity.check_rows(policy, graph, observations[policy], spaces.action)
         proof = parity.check_parity(directory / file, policy, module, observations[policy], spaces.action)
-        policy_probes = parity.probes(OnnxPolicy(directory / file), observations[policy])
+        policy_probes = parity.probes(graph, observations[policy])
         (directory / probes).write_bytes(policy_probes.to_bytes())
         if critic is not None and value is not None:
             parity.check_value(directory / value, policy, critic, scale, observations[policy])

@@ -265,7 +265,7 @@ def _increases(node: NodeProto, one: _CheckedBatch, before: _CheckedBatch, last:
     """
     for name in filter(None, node.output):
         shapes = (one.shapes[name], before.shapes[name], last.shapes[name])
-        if not all(a <= b <= c for a, b, c in zip(*shapes, strict=True)):
+        if len(set(map(len, shapes))) > 1 or not all(a <= b <= c for a, b, c in zip(*shapes, strict=True)):
             return False
         if name in last.values and not _is_sorted([batch.values.get(name) for batch in (one, before, last)]):
             return False

@@ -13,7 +13,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import PROBES, Manifest, PolicyManifest
 from league.registry.storage.rows import VersionRow
 from league.stack import installed
-from training.export.parity import probes
+from training.export.parity import check_rows, probes
 from training.importing import checks
 from training.importing.adapted_graph import adapt, graph_tensors
 from training.importing.source import Source
@@ -87,9 +87,9 @@ def _write(
     played = checks.collect(environment, interface, graphs, seed)
     policies = {}
     for policy, graph in graphs.items():
-        parity = checks.check_parity(
-            policy, graph, sources[policy].original, played[policy], interface.of_policy(policy)
-        )
+        spaces = interface.of_policy(policy)
+        check_rows(policy, graph, played[policy], spaces.action)
+        parity = checks.check_parity(policy, graph, sources[policy].original, played[policy], spaces)
         (staging / partial[policy]["probes"]).write_bytes(probes(graph, played[policy]).to_bytes())
         policies[policy] = PolicyManifest(**partial[policy], parity=parity)
     return policies

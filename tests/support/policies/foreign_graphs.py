@@ -27,6 +27,36 @@ def foreign(
     return _model(nodes, [value_infos], [result], weights, opset)
 
 
+def influenced(kind: str) -> bytes:
+    """A graph for 18 float32 to 9 logits whose rows influence each other, or that draws random numbers.
+
+    kind: softmax, running_sum, normalized, ranked or unbatched, all over axis 0; or dropout.
+    """
+    ends = {"softmax": helper.make_node("Softmax", ["scores"], ["policy_head"], axis=0)}
+    ends["running_sum"] = helper.make_node("CumSum", ["scores", "zero"], ["policy_head"])
+    ends["normalized"] = helper.make_node(
+        "BatchNormalization", ["scores", "ones", "zeros", "zeros", "ones"], ["policy_head", "mean", "var"],
+        training_mode=1,
+    )  # fmt: skip
+    ends["ranked"] = helper.make_node("TopK", ["scores", "rows"], ["policy_head", "ranks"], axis=0)
+    ends["unbatched"] = helper.make_node("Squeeze", ["scores"], ["policy_head"])
+    ends["dropout"] = helper.make_node("Dropout", ["scores", "half", "true"], ["policy_head"])
+    weights = {
+        "w": np.random.default_rng(0).normal(size=(18, 9)).astype(np.float32), "flat": np.array([-1, 18], np.int64),
+        "zero": np.int64(0), "half": np.float32(0.5), "true": np.bool_(True),
+        "ones": np.ones(9, np.float32), "zeros": np.zeros(9, np.float32),
+    }  # fmt: skip
+    nodes = [
+        helper.make_node("Reshape", ["planes", "flat"], ["columns"]),
+        helper.make_node("MatMul", ["columns", "w"], ["scores"]),
+        helper.make_node("Shape", ["scores"], ["rows"], start=0, end=1),
+        ends[kind],
+    ]
+    planes = helper.make_tensor_value_info("planes", TensorProto.FLOAT, ["N", 3, 3, 2])
+    result = helper.make_tensor_value_info("policy_head", TensorProto.FLOAT, ["N", 9])
+    return _model(nodes, [planes], [result], weights, 18)
+
+
 def remembering(size: int, outputs: int) -> bytes:
     """A recurrent graph: `hidden_out` is a decaying sum of the observations, from which `policy_head` is computed."""
     rng = np.random.default_rng(0)

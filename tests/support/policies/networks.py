@@ -1,5 +1,6 @@
 """Networks of users' code for tic-tac-toe, most of which are refused. A comment marks the line that is to be named."""
 
+import random
 from typing import Any
 
 import gymnasium
@@ -37,6 +38,16 @@ class Decomposing(Good):
 class Random(Good):
     def forward(self, observations: dict[str, Tensor]) -> Tensor:  # Random
         return super().forward(observations) + torch.rand(WIDTH)
+
+
+class Drawn(Good):
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:  # Drawn
+        return super().forward(observations) + random.random()
+
+
+class Mixing(Good):
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:  # Mixing
+        return super().forward(observations).softmax(dim=0)
 
 
 class Raising(Good):

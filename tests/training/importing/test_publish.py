@@ -13,7 +13,7 @@ from league.policies import load
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from tests.support.leagues import tictactoe
-from tests.support.policies.foreign_graphs import foreign
+from tests.support.policies.foreign_graphs import foreign, influenced
 from training.importing import checks
 from training.importing.open_source import open_sources
 from training.importing.publish import publish
@@ -84,6 +84,29 @@ def test_illegal_actions_are_refused(registry: Registry, tmp_path: Path) -> None
     path = tmp_path / "foreign.onnx"
     path.write_bytes(foreign(18, 9, shape=(3, 3, 2), kind="action"))
     with pytest.raises(ParityError, match=r"policy shared: action [0-9] is illegal, where action_mask"):
+        imported(registry, path)
+    assert registry.versions.all(tictactoe.LEAGUE) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "problem"),
+    [
+        ("softmax", "computes other .* 256 observations alone than in a batch: its rows influence each other"),
+        ("running_sum", "computes other .* 256 observations alone than in a batch: its rows influence each other"),
+        (
+            "normalized",
+            "computes other outputs for 256 of 256 observations in a second run: as with Dropout or BatchNorm",
+        ),
+        ("ranked", "computes other .* 256 observations alone than in a batch: its rows influence each other"),
+        ("dropout", "greedy actions of the source differ from run to run, as with Dropout"),
+    ],
+)
+def test_a_graph_acts_on_each_observation_by_itself(
+    registry: Registry, tmp_path: Path, kind: str, problem: str
+) -> None:
+    path = tmp_path / "foreign.onnx"
+    path.write_bytes(influenced(kind))
+    with pytest.raises(ParityError, match=f"policy shared:? {problem}"):
         imported(registry, path)
     assert registry.versions.all(tictactoe.LEAGUE) == []
 
