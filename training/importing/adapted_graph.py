@@ -22,6 +22,8 @@ BATCH = "batch"
 PREFIX = "imported/"
 CERTAIN = 20.0
 """Logit of the action that a graph has chosen itself, and minus the log standard deviation of such a Gaussian."""
+LEAST = np.finfo(np.float32).tiny
+"""Probability instead of 0, whose logarithm is not finite."""
 
 Tensors = tuple[Tensor, ...]
 
@@ -58,7 +60,7 @@ def adapt(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface,
     elif mapping.kind == "action":
         builder.chosen(PREFIX + mapping.output, action)
     else:
-        builder.logits(PREFIX + mapping.output, action, masked)
+        builder.logits(PREFIX + mapping.output, mapping, action, masked)
     input_tensors, output_tensors, _ = graph_tensors(model, mapping, spaces)
     return builder.serialized(input_tensors, output_tensors)
 
@@ -138,7 +140,9 @@ def _check_output(
 ) -> None:
     if isinstance(spaces.action, DictSpace):
         refuse("dict actions are not supported")
-    allowed = ("gaussian", "action") if isinstance(spaces.action, Box) else ("logits", "values", "action")
+    allowed = (
+        ("gaussian", "action") if isinstance(spaces.action, Box) else ("logits", "probabilities", "values", "action")
+    )
     if mapping.kind not in allowed:
         refuse(f"kind: {mapping.kind} does not fit {spaces.action.type} actions, expected one of {', '.join(allowed)}")
     width = dist_inputs_size(spaces.action)
@@ -164,9 +168,11 @@ class _Builder:
             value = self._reshaped(value, shape[1:])
         self.node("Identity", [value], name)
 
-    def logits(self, output: str, action: Leaf, masked: bool) -> None:
-        """Greedy action of masked logits or action values."""
+    def logits(self, output: str, mapping: GraphMapping, action: Leaf, masked: bool) -> None:
+        """Greedy action of masked logits, logarithms of probabilities, or action values."""
         value = self._cast(output, "", "float32")
+        if mapping.kind == "probabilities":
+            value = self._new("Log", [self._new("Max", [value, self._constant(LEAST)])])
         if masked:
             none = self._constant(np.zeros(1, np.float32))
             illegal = self._new("Equal", [self._cast(ACTION_MASK, "", "float32"), none])
@@ -290,23 +296,25 @@ def _infos(described: Tensors) -> list[ValueInfoProto]:
     ]
 
 
-def decoded(value: NDArray, mask: NDArray | None, mapping: GraphMapping, action: Leaf) -> NDArray:
-    """Return the greedy actions (k, …) for the output of the source, computed in NumPy."""
+def decoded(
+    value: NDArray, mask: NDArray | None, mapping: GraphMapping, action: Leaf
+) -> tuple[NDArray, NDArray | None]:
+    """Return the greedy actions (k, …) for the output of the source, and its logits or values if it has them."""
     if mapping.kind == "action":
         actions = value.reshape(-1, *action.shape)
-        return (
-            np.clip(actions, *bounds(action)).astype(action.dtype)
-            if isinstance(action, Box)
-            else actions.astype(np.int64)
-        )
+        if isinstance(action, Box):
+            actions = np.clip(actions, *bounds(action))
+        return actions.astype(action.dtype if isinstance(action, Box) else np.int64), None
     if isinstance(action, Box):
         means = value[:, : value.shape[1] // 2].reshape(-1, *action.shape)
         if mapping.units == "environment":
-            return np.clip(means.astype(np.float64), *bounds(action)).astype(action.dtype)
-        return to_environment(means, action)
+            return np.clip(means.astype(np.float64), *bounds(action)).astype(action.dtype), None
+        return to_environment(means, action), None
+    if mapping.kind == "probabilities":
+        value = np.log(np.maximum(value, LEAST))
     allowed = value if mask is None else np.where(mask != 0, value, -np.inf)
     if isinstance(action, MultiDiscrete):
         raw = np.stack([part.argmax(axis=1) for part in elements(allowed, action)], axis=1)
     else:
         raw = allowed.argmax(axis=1)
-    return to_environment(raw, action)
+    return to_environment(raw, action), value

@@ -10,17 +10,21 @@ from league.config.environment import EnvironmentConfig
 from league.environments.stepping import legal_rows
 from league.errors import ParityError
 from league.interface import AgentInterface, Interface
+from league.policies.draws import elements
 from league.policies.onnx import OnnxPolicy
 from league.policies.probes import excused, same
 from league.policies.scripted import Random
 from league.random.seeds import derive, generator
 from league.registry.storage.manifest import Parity
-from league.spaces import ACTION_MASK, DictSpace
+from league.spaces import ACTION_MASK, DictSpace, Leaf, MultiDiscrete
 from training.export.parity import BY_CHANCE, ObservedBatch, PlayLimits, observed_play
-from training.importing.source import Original, known_logits
+from training.importing.source import Source, known_logits
 from training.sampling.reset_seeds import SEEDS
 
 IMPORTED = PlayLimits(observations=10_000, megabytes=256, enough_seconds=300.0, most_seconds=600.0)
+
+ROUNDED = 1e-3
+"""Maximum difference of a sum of probabilities from 1: models may compute with half precision."""
 
 
 def collect(
@@ -52,15 +56,16 @@ def collect(
 
 
 def check_parity(
-    policy: str, graph: OnnxPolicy, original: Original, batches: list[ObservedBatch], spaces: AgentInterface
+    policy: str, graph: OnnxPolicy, source: Source, batches: list[ObservedBatch], spaces: AgentInterface
 ) -> Parity:
     """Compare the greedy actions of the imported graph with those of its source.
 
-    Raises ParityError if one differs other than in a near tie, or if an output is not finite.
+    Raises ParityError if one differs other than in a near tie, if an output is not finite, or if probabilities would be
+    taken for logits or the other way round.
     """
-    action = spaces.action
+    action, original, kind = spaces.action, source.original, source.mapping.kind
     assert not isinstance(action, DictSpace)
-    mismatches = near_ties = 0
+    mismatches = near_ties = probabilities = 0
     largest = 0.0
     for played in batches:
         answer = graph.distribution(played.observations, state=played.state or None)
@@ -69,6 +74,10 @@ def check_parity(
             raise ParityError(f"policy {policy}: the graph has outputs that are not finite")
         state = dict(zip(original.initial_state(1), played.state.values(), strict=True))
         expected, logits, after = original.act(played.observations, state)
+        if logits is not None:
+            probabilities += int(
+                _are_probabilities(np.exp(logits) if kind == "probabilities" else logits, action).sum()
+            )
         alike = same(answer.actions, expected, action)
         fine = excused(answer.actions, expected, known_logits(logits, expected, spaces), action)
         if not fine.all() and not same(original.act(played.observations, state)[0], expected, action).all():
@@ -78,6 +87,23 @@ def check_parity(
         for graph_state, source_state in zip((answer.state or {}).values(), after.values(), strict=True):
             largest = max(largest, float(np.abs(graph_state - source_state).max()))
     count = sum(map(len, batches))
+    if kind == "probabilities" and probabilities < count:
+        raise ParityError(
+            f"policy {policy}: for {count - probabilities} of {count} observations, {source.mapping.output} is not"
+            " probabilities: expected numbers from 0 to 1 with the sum 1"
+        )
+    if kind == "logits" and source.inferred and probabilities == count:
+        raise ParityError(
+            f"policy {policy}: for all {count} observations, the numbers of {source.mapping.output} are from 0 to 1"
+            " with the sum 1. As logits they would make sampled play almost uniform: write a mapping file with"
+            " `kind: probabilities`, or with `kind: logits` if they are logits"
+        )
     if mismatches:
         raise ParityError(f"policy {policy}: {mismatches} of {count} greedy actions differ from those of the source")
     return Parity(observations=count, mismatches=0, near_ties=near_ties, max_difference=largest)
+
+
+def _are_probabilities(values: NDArray, action: Leaf) -> NDArray[np.bool_]:
+    """Return whether each row of numbers, (k, d), is a distribution of each element of an action, (k,) bool."""
+    sums = [part.sum(axis=1) for part in (elements(values, action) if isinstance(action, MultiDiscrete) else [values])]
+    return (values >= 0).all(axis=1) & (np.abs(np.stack(sums, axis=1) - 1) <= ROUNDED).all(axis=1)

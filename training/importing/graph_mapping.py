@@ -15,7 +15,7 @@ from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
 from league.spaces import ACTION_MASK, Box, DictSpace, inputs
 
-Kind = Literal["logits", "values", "gaussian", "action"]
+Kind = Literal["logits", "probabilities", "values", "gaussian", "action"]
 
 
 class InputMapping(FrozenModel):
@@ -51,8 +51,8 @@ class GraphMapping(FrozenModel):
     output: str
     """The output that determines the action."""
     kind: Kind
-    """logits or action values of Discrete and MultiDiscrete actions; means, then log standard deviations; or a finished
-    action in the units of the action space."""
+    """logits, probabilities or values of Discrete and MultiDiscrete actions; means, then log standard deviations; or a
+    finished action in the units of the action space."""
     units: Literal["normalized", "environment"] = "normalized"
     """Units of a Gaussian for actions with bounds: [-1, 1] stands for the bounds, or the units of the action space."""
     state: dict[str, str] = Field(default={})

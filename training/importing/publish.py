@@ -89,7 +89,7 @@ def _write(
     for policy, graph in graphs.items():
         spaces = interface.of_policy(policy)
         check_rows(policy, graph, played[policy], spaces.action)
-        parity = checks.check_parity(policy, graph, sources[policy].original, played[policy], spaces)
+        parity = checks.check_parity(policy, graph, sources[policy], played[policy], spaces)
         (staging / partial[policy]["probes"]).write_bytes(probes(graph, played[policy]).to_bytes())
         policies[policy] = PolicyManifest(**partial[policy], parity=parity)
     return policies

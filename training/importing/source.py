@@ -37,13 +37,16 @@ class Original(Protocol):
 class Source:
     """A model to import as one policy.
 
-    origin: what the manifest records: format, file, digest, mapping.
+    Attributes:
+        origin: What the manifest records: format, file, digest, mapping.
+        inferred: Whether nobody said what the output means.
     """
 
     model: onnx.ModelProto
     mapping: GraphMapping
     original: Original
     origin: dict[str, Any]
+    inferred: bool = False
 
 
 class OnnxOriginal:
@@ -80,8 +83,7 @@ class OnnxOriginal:
             raise GraphTimeout(f"{self._source}: {error}") from error
         except Exception as error:
             raise InvalidInput(f"{self._source}: the graph fails on observations: {one_line(error)}") from error
-        actions = decoded(value, observations.get(ACTION_MASK), self._mapping, self._action)
-        logits = value if self._mapping.kind in ("logits", "values") else None
+        actions, logits = decoded(value, observations.get(ACTION_MASK), self._mapping, self._action)
         return actions, logits, dict(zip(self._mapping.state, after, strict=True))
 
 
@@ -107,7 +109,7 @@ def onnx_source(path: Path, mapping: Path | None, spaces: AgentInterface, origin
     file = mapping or (beside if beside.exists() else None)
     names = GraphMapping.load(file) if file else inferred(model, spaces, str(path))
     model = checked(model, names, spaces, str(path))
-    return Source(model, names, OnnxOriginal(model, names, spaces, str(path)), origin)
+    return Source(model, names, OnnxOriginal(model, names, spaces, str(path)), origin, inferred=file is None)
 
 
 def checked(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface, source: str) -> onnx.ModelProto:

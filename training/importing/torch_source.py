@@ -44,8 +44,7 @@ class ModuleOriginal:
             arguments.append(value.reshape(-1, *shape))
         with torch.no_grad():
             value = self._module(*arguments).numpy()
-        actions = decoded(value, observations.get(ACTION_MASK), self._mapping, self._action)
-        return actions, value if self._mapping.kind in ("logits", "values") else None, state
+        return *decoded(value, observations.get(ACTION_MASK), self._mapping, self._action), state
 
 
 def converted(module: nn.Module, examples: Examples, output: str, source: str) -> onnx.ModelProto:
@@ -90,9 +89,8 @@ def torch_source(path: Path, mapping: Path | None, spaces: AgentInterface, origi
     model = onnx_program(program, (), names, ["output"]).model_proto
     graph_mapping = GraphMapping.load(mapping) if mapping else inferred(model, spaces, str(path))
     model = checked(model, graph_mapping, spaces, str(path))
-    return Source(
-        model, graph_mapping, ModuleOriginal(_Called(program.module()), examples, graph_mapping, spaces), origin
-    )
+    original = ModuleOriginal(_Called(program.module()), examples, graph_mapping, spaces)
+    return Source(model, graph_mapping, original, origin, inferred=mapping is None)
 
 
 class _Called(nn.Module):

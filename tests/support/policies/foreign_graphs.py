@@ -11,15 +11,17 @@ def foreign(
 ) -> bytes:
     """A linear map from `planes` (float32, any shape of `size`) to `policy_head`, without a mask.
 
-    kind: logits, gaussian or action, which is then the arg max.
+    kind: logits, gaussian, probabilities after a softmax, or action, which is then the arg max.
     """
     rng = np.random.default_rng(seed)
     weights = {"w": rng.normal(size=(size, outputs)).astype(np.float32), "flat": np.array([-1, size], np.int64)}
     nodes = [
         helper.make_node("Reshape", ["planes", "flat"], ["columns"]),
-        helper.make_node("MatMul", ["columns", "w"], ["policy_head" if kind != "action" else "scores"]),
+        helper.make_node("MatMul", ["columns", "w"], ["policy_head" if kind in ("logits", "gaussian") else "scores"]),
     ]
     result = helper.make_tensor_value_info("policy_head", TensorProto.FLOAT, ["N", outputs])
+    if kind == "probabilities":
+        nodes.append(helper.make_node("Softmax", ["scores"], ["policy_head"], axis=1))
     if kind == "action":
         nodes.append(helper.make_node("ArgMax", ["scores"], ["policy_head"], axis=1, keepdims=0))
         result = helper.make_tensor_value_info("policy_head", TensorProto.INT64, ["N"])

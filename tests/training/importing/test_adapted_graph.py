@@ -45,6 +45,7 @@ FREE = Box(dtype="float32", shape=(2,), low=[None, 0.0], high=[None, None])
     [
         (DISCRETE, 5, "logits", {}),
         (SHIFTED, 5, "values", {}),
+        (SHIFTED, 5, "probabilities", {}),
         (SHIFTED, 5, "action", {}),
         (MULTI, 5, "logits", {}),
         (BOUNDED, 4, "gaussian", {}),
@@ -59,7 +60,7 @@ def test_greedy_actions_equal_those_of_the_source(
 ) -> None:
     integer = kind == "action" and isinstance(action, Discrete)
     model = onnx.load_from_string(foreign(6, outputs, shape=shape, kind="action" if integer else "logits"))
-    has_mask = kind in ("logits", "values")
+    has_mask = kind in ("logits", "values", "probabilities")
     spaces = AgentInterface(observation=masked(5) if has_mask else SEEN, action=action)
     names = GraphMapping(
         inputs={"planes": {"name": "observation", "transpose": transpose}}, output="policy_head", kind=kind, **extra

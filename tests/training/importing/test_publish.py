@@ -4,8 +4,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
+from scipy.special import softmax
 
 from evaluation.matches.tournament import evaluate
 from league.errors import ConfigError, EnvironmentMismatch, ParityError
@@ -78,6 +80,34 @@ def test_a_mapping_file_names_the_tensors(registry: Registry, tmp_path: Path) ->
         imported(registry, path)
     mapping.write_text("inputs: {planes: observation}\noutput: policy_head\nkind: values\n")
     assert imported(registry, path, mapping).number == 1
+
+
+def test_probabilities_are_not_taken_for_logits(registry: Registry, tmp_path: Path) -> None:
+    path, mapping = tmp_path / "foreign.onnx", tmp_path / "names.yaml"
+    path.write_bytes(foreign(18, 9, shape=(3, 3, 2), kind="probabilities"))
+    with pytest.raises(ParityError, match=r"policy_head are from 0 to 1 with the sum 1.* `kind: probabilities`"):
+        imported(registry, path)
+    mapping.write_text("inputs: {planes: observation}\noutput: policy_head\nkind: probabilities\n")
+    number = imported(registry, path, mapping).number
+    board, legal = np.zeros((1, 3, 3, 2), np.int8), np.ones((1, 9), np.int8)
+    legal[0, 0] = 0
+    observation = {"observation": board + 1, "action_mask": legal}
+    dist_inputs = (
+        load(f"tictactoe@{number}", registry=registry)
+        .act(observation, explore=True, rng=[np.random.default_rng(0)])
+        .dist_inputs
+    )
+    weights = onnx.numpy_helper.to_array(onnx.load_from_string(foreign(18, 9)).graph.initializer[0])
+    expected = np.where(legal[0] != 0, np.exp(weights.sum(axis=0)), 0)
+    np.testing.assert_allclose(softmax(dist_inputs[0]), expected / expected.sum(), rtol=1e-4)
+
+
+def test_logits_are_not_taken_for_probabilities(registry: Registry, tmp_path: Path) -> None:
+    path, mapping = tmp_path / "foreign.onnx", tmp_path / "names.yaml"
+    path.write_bytes(foreign(18, 9, shape=(3, 3, 2)))
+    mapping.write_text("inputs: {planes: observation}\noutput: policy_head\nkind: probabilities\n")
+    with pytest.raises(ParityError, match=r"for \d+ of \d+ observations, policy_head is not probabilities: expected"):
+        imported(registry, path, mapping)
 
 
 def test_illegal_actions_are_refused(registry: Registry, tmp_path: Path) -> None:
