@@ -28,6 +28,7 @@ def open_sources(
     kind: SourceKind | None = None,
     mapping: Path | None = None,
     modules: Mapping[str, str] | None = None,
+    vec_normalize: Path | None = None,
     trust: bool = False,
 ) -> tuple[dict[str, Source], str]:
     """Open the models for all policies of a league.
@@ -38,6 +39,8 @@ def open_sources(
         kind: Format of `path`; by default its suffix decides.
         mapping: File with a GraphMapping, for ONNX files and programs.
         modules: With RLlib: policy id → module id, where they differ.
+        vec_normalize: With Stable-Baselines3: statistics of VecNormalize for all policies, or a directory with a file
+            for each.
         trust: Whether code in `path` may run: reading any format except ONNX can run code.
 
     Returns:
@@ -57,6 +60,8 @@ def open_sources(
         )
     if modules and kind != "rllib":
         raise InvalidInput("--policy: only checkpoints of RLlib contain several modules; it requires --rllib")
+    if vec_normalize is not None and kind != "sb3":
+        raise InvalidInput("--vec-normalize: only models of Stable-Baselines3 have its statistics; it requires --sb3")
     if unknown := [policy for policy in modules or () if policy not in interface.policy_ids]:
         raise InvalidInput(f"--policy {unknown[0]}: expected one of {', '.join(interface.policy_ids)}")
     files = {policy: _file(path, policy, SUFFIXES[kind]) for policy in interface.policy_ids}
@@ -68,13 +73,15 @@ def open_sources(
         if formats[policy] != "onnx" and not trust:
             name = NAMES[formats[policy]]
             raise InvalidInput(f"{file}: reading {name} runs code from it: add --trust if you trust its author")
-    digest = _digest(path, mapping, modules)
+    digest = _digest(path, [mapping, vec_normalize], modules)
     sources = {}
     for policy, file in files.items():
         origin: dict[str, Any] = {"format": formats[policy], "file": path.name, "sha256": digest}
         module = (modules or {}).get(policy, policy)
         try:
-            sources[policy] = _read(file, formats[policy], module, mapping, interface.of_policy(policy), origin)
+            statistics = None if vec_normalize is None else _file(vec_normalize, policy, (".pkl",))
+            spaces = interface.of_policy(policy)
+            sources[policy] = _read(file, formats[policy], module, mapping, statistics, spaces, origin)
         except LeagueError:
             raise
         except Exception as error:  # the libraries that read a damaged file raise many kinds
@@ -84,7 +91,13 @@ def open_sources(
 
 
 def _read(
-    file: Path, file_format: str, module: str, mapping: Path | None, spaces: AgentInterface, origin: dict[str, Any]
+    file: Path,
+    file_format: str,
+    module: str,
+    mapping: Path | None,
+    vec_normalize: Path | None,
+    spaces: AgentInterface,
+    origin: dict[str, Any],
 ) -> Source:
     if file_format == "rllib":
         from training.importing.rllib_source import rllib_source
@@ -93,7 +106,9 @@ def _read(
     if file_format == "sb3":
         from training.importing.sb3_source import sb3_source
 
-        return sb3_source(file, spaces, origin)
+        if vec_normalize is not None:
+            origin |= {"vec_normalize": vec_normalize.name}
+        return sb3_source(file, vec_normalize, spaces, origin)
     if file_format == "torch.export":
         from training.importing.torch_source import torch_source
 
@@ -112,13 +127,13 @@ def _file(path: Path, policy: str, suffixes: Sequence[str]) -> Path:
     raise ConfigError(f"{path}: no file {' or '.join(file.name for file in candidates)}")
 
 
-def _digest(path: Path, *choices: object) -> str:
+def _digest(path: Path, others: Sequence[Path | None], modules: Mapping[str, str] | None) -> str:
     """Digest of a file or of all files of a directory, and of what else decides how they are imported."""
     digest = hashlib.sha256()
-    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    mapping = [choice for choice in (choices[0],) if isinstance(choice, Path) and choice.exists()]
-    for file in [*files, *mapping, *([beside] if (beside := path.with_suffix(".yaml")).exists() else [])]:
-        digest.update(file.name.encode())
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    digest.update(repr(choices[1:]).encode())
+    for source in (path, *others, path.with_suffix(".yaml")):
+        if source is not None and source.exists():
+            for file in sorted(file for file in source.rglob("*") if file.is_file()) if source.is_dir() else [source]:
+                digest.update(file.name.encode())
+                digest.update(hashlib.sha256(file.read_bytes()).digest())
+    digest.update(repr((modules,)).encode())
     return digest.hexdigest()

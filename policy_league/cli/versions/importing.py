@@ -29,6 +29,10 @@ def import_model(
         list[str] | None,
         typer.Option(metavar="NAME=MODULE", help="With --rllib: the module of a policy. Default: the same name."),
     ] = None,
+    vec_normalize: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="With --sb3: statistics of VecNormalize, which become a part of the model."),
+    ] = None,
     trust: Annotated[
         bool,
         typer.Option("--trust", help="Allow code in SOURCE to run. Every format except ONNX requires it."),
@@ -47,7 +51,12 @@ def import_model(
     interface = registry.leagues.get(check_slug("league", league)).interface
     modules = dict(_pair(text) for text in policy or ())
     kind: SourceKind | None = "rllib" if rllib else "sb3" if sb3 else None
-    sources, digest = open_sources(source, interface, kind=kind, mapping=mapping, modules=modules, trust=trust)
+    sources, digest = open_sources(
+        source, interface, kind=kind, mapping=mapping, modules=modules, vec_normalize=vec_normalize, trust=trust
+    )
+    if sb3:
+        wrappers = "wrappers of the training script" + (" except VecNormalize" if vec_normalize else "")
+        say(f"{source.name} is without {wrappers}: league {league} must give the observations that its policy saw.")
     version = publish(league, sources, digest=digest, registry=registry)
     if note:
         registry.versions.set_note(CheckpointRef.parse(version.ref), note, actor="import")

@@ -1,5 +1,6 @@
 """Models of PyTorch: `torch.export` programs, modules of RLlib, and files of Stable-Baselines3."""
 
+import pickle
 import zipfile
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -222,6 +223,109 @@ def test_a_file_of_stable_baselines(tmp_path: Path, algorithm: str, action: gymn
     getattr(library, algorithm)("MlpPolicy", SpacesOnly(action), **options).save(tmp_path / "model.zip")
     sources, _ = open_sources(tmp_path / "model.zip", interface(action), kind="sb3", trust=True)
     assert_equal_actions(sources["shared"], action)
+
+
+def saved_statistics(library: Any, file: Path, observation: gymnasium.Space[Any], **options: Any) -> Any:
+    """A VecNormalize with means and variances far from 0 and 1, which `file` contains."""
+    environments = library.common.vec_env.DummyVecEnv([lambda: SpacesOnly(FIVE, observation)])
+    statistics = library.common.vec_env.VecNormalize(environments, **options)
+    if isinstance(observation, gymnasium.spaces.Box) and statistics.norm_obs:
+        rng = np.random.default_rng(1)
+        statistics.obs_rms.mean = rng.uniform(-900, 900, observation.shape)
+        statistics.obs_rms.var = rng.uniform(0.01, 900, observation.shape)
+    statistics.save(file)
+    return statistics
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("algorithm", "action"), [("PPO", FIVE), ("DQN", FIVE), ("PPO", STEERED), ("SAC", STEERED)])
+def test_statistics_of_vec_normalize_are_a_part_of_the_graph(
+    tmp_path: Path, algorithm: str, action: gymnasium.Space[Any]
+) -> None:
+    library = pytest.importorskip("stable_baselines3")
+    torch.manual_seed(0)
+    options = {"buffer_size": 10} if algorithm in ("DQN", "SAC") else {}
+    model = getattr(library, algorithm)("MlpPolicy", SpacesOnly(action), **options)
+    model.save(tmp_path / "model.zip")
+    file = tmp_path / "my_VecNormalize_5_steps.pkl"
+    statistics = saved_statistics(library, file, SEEN, clip_obs=2.0)
+    with pytest.raises(InvalidInput, match=f"add --vec-normalize {file}, or move that file"):
+        open_sources(tmp_path / "model.zip", interface(action), kind="sb3", trust=True)
+    sources, digest = open_sources(
+        tmp_path / "model.zip", interface(action), kind="sb3", vec_normalize=file, trust=True
+    )
+    source, spaces = sources["shared"], interface(action).of_policy("shared")
+    assert source.origin["vec_normalize"] == file.name
+    near = statistics.obs_rms.mean + np.random.default_rng(0).normal(0, 30, (ROWS, 4))
+    observations = {"observation": near.astype(np.float32)}
+    answer = OnnxPolicy(adapt(source.model, source.mapping, spaces, "test")).distribution(observations)
+    expected = model.predict(statistics.normalize_obs(observations["observation"]), deterministic=True)[0]
+    original, logits, _ = source.original.act(observations, {})
+    assert answer.dist_inputs is not None
+    assert excused(answer.actions, expected, known_logits(logits, expected, spaces), spaces.action).all()
+    np.testing.assert_array_equal(original, expected)
+    statistics.obs_rms.mean += 1
+    statistics.save(file)
+    other = open_sources(tmp_path / "model.zip", interface(action), kind="sb3", vec_normalize=file, trust=True)[1]
+    assert other != digest
+
+
+@pytest.mark.slow
+def test_other_statistics_are_refused(tmp_path: Path) -> None:
+    library = pytest.importorskip("stable_baselines3")
+    library.PPO("MlpPolicy", SpacesOnly(FIVE)).save(tmp_path / "model.zip")
+
+    def opened(file: Path) -> Source:
+        sources, _ = open_sources(tmp_path / "model.zip", interface(FIVE), kind="sb3", vec_normalize=file, trust=True)
+        return sources["shared"]
+
+    file = tmp_path / "vecnormalize.pkl"
+    with pytest.raises(ConfigError, match=r"--vec-normalize .*vecnormalize.pkl: No such file"):
+        opened(file)
+    file.write_bytes(b"text")
+    with pytest.raises(ConfigError, match="not a pickle"):
+        opened(file)
+    file.write_bytes(pickle.dumps([]))
+    with pytest.raises(ConfigError, match=r"a list, expected what VecNormalize\.save writes"):
+        opened(file)
+    saved_statistics(library, file, gymnasium.spaces.Box(-1, 1, (8,)))
+    with pytest.raises(EnvironmentMismatch, match=r"statistics are of observations \[8\]: expected \[4\]"):
+        opened(file)
+    saved_statistics(library, file, gymnasium.spaces.Dict({"a": SEEN}))
+    with pytest.raises(EnvironmentMismatch, match=r"statistics are of observations a Dict"):
+        opened(file)
+    saved_statistics(library, file, SEEN, norm_obs=False)
+    assert_equal_actions(opened(file), FIVE)
+
+
+@pytest.mark.slow
+def test_normalized_images_keep_the_order_of_their_axes(tmp_path: Path) -> None:
+    """VecNormalize is applied before Stable-Baselines3 transposes images."""
+    library = pytest.importorskip("stable_baselines3")
+    torch.manual_seed(0)
+    pixels, file = gymnasium.spaces.Box(0, 255, (40, 36, 3), np.uint8), tmp_path / "vecnormalize.pkl"
+    statistics = saved_statistics(library, file, pixels)
+    first = SpacesOnly(FIVE, gymnasium.spaces.Box(-10, 10, (3, 40, 36), np.float32))
+    model = library.PPO("CnnPolicy", first, policy_kwargs={"normalize_images": False})
+    model.save(tmp_path / "model.zip")
+    spaces = AgentInterface(observation=from_gymnasium(pixels), action=from_gymnasium(FIVE))
+    of_images = Interface(agents={"agent": spaces}, policies={"agent": "shared"}, sides={"agent": ("agent",)})
+    sources, _ = open_sources(tmp_path / "model.zip", of_images, kind="sb3", vec_normalize=file, trust=True)
+    source = sources["shared"]
+    images = np.random.default_rng(0).integers(0, 256, (50, 40, 36, 3), dtype=np.uint8)
+    answer = OnnxPolicy(adapt(source.model, source.mapping, spaces, "test")).distribution({"observation": images})
+    normalized = statistics.normalize_obs(images).transpose(0, 3, 1, 2)
+    expected = model.predict(normalized, deterministic=True)[0]
+    original, logits, _ = source.original.act({"observation": images}, {})
+    np.testing.assert_array_equal(original, expected)
+    assert answer.dist_inputs is not None
+    assert np.allclose(answer.dist_inputs, logits, atol=1e-3)
+
+
+def test_statistics_are_of_stable_baselines(tmp_path: Path) -> None:
+    (tmp_path / "model.onnx").touch()
+    with pytest.raises(InvalidInput, match="--vec-normalize: only models of Stable-Baselines3"):
+        open_sources(tmp_path / "model.onnx", interface(FIVE), vec_normalize=tmp_path / "vecnormalize.pkl")
 
 
 @pytest.mark.slow
