@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from league.environment_code import environment_code, module_in
-from league.errors import OWN_PACKAGES, ConfigError, raised_at
+from league.errors import OWN_PACKAGES, ConfigError, no_exit, raised_at
 
 _folders: list[str] = []
 
@@ -45,8 +45,9 @@ def import_module(key: str, name: str, folder: str | None = None) -> ModuleType:
     try:
         _check_name(key, name, folders)
         _check_files(key, name, folder)
-        _import_own(key, name.partition(".")[0], folders)
-        module = importlib.import_module(name)
+        with no_exit:
+            _import_own(key, name.partition(".")[0], folders)
+            module = importlib.import_module(name)
         _check_files(key, name, folder)
         return module
     except ConfigError:

@@ -1,9 +1,11 @@
 """The exceptions, which the client raises too, and what only the program does with them."""
 
+import signal
 import sysconfig
 import traceback
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import policy_league_client
@@ -16,6 +18,28 @@ OWN_PACKAGES = {
     for package in ("evaluation", "league", "policy_league", "serve_app", "training")
 } | {"policy_league_client": f"{Path(policy_league_client.__file__).parent}/"}
 """Package of this project → its folder, with a slash at the end."""
+
+
+class ExitCalled(Exception):
+    """SystemExit of a user's code, as `sys.exit()` raises it in a game whose window closes."""
+
+
+class _NoExit:
+    """Turns SystemExit into ExitCalled: code of a user that ends must not end a process of ours. Without state."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # Ray's handler of SIGTERM exits with the number of the signal.
+        if isinstance(error, SystemExit) and error.code != signal.SIGTERM:
+            code = "" if error.code is None else repr(error.code)
+            raise ExitCalled(f"sys.exit({code}) was called").with_traceback(trace) from error
+
+
+no_exit = _NoExit()
 
 
 def raised_at(error: BaseException) -> str | None:

@@ -13,7 +13,7 @@ import gymnasium
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
-from league.errors import EnvironmentMismatch
+from league.errors import EnvironmentMismatch, no_exit
 
 NAMES = {"aec": "a PettingZoo AECEnv", "parallel": "a PettingZoo ParallelEnv", "rllib": "an RLlib MultiAgentEnv"}
 
@@ -57,8 +57,9 @@ def with_api(env: Any, api: str) -> Any:
 
 def _has_spaces(env: Any) -> bool:
     try:
-        agents = list(env.possible_agents)
-        spaces = [space(agent) for agent in agents for space in (env.observation_space, env.action_space)]
+        with no_exit:
+            agents = list(env.possible_agents)
+            spaces = [space(agent) for agent in agents for space in (env.observation_space, env.action_space)]
     except Exception:
         return False
     return bool(agents) and all(isinstance(space, gymnasium.Space) for space in spaces)

@@ -29,7 +29,7 @@ from league.environments.declared import declared
 from league.environments.info_masks import with_info_masks
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
 from league.environments.wrappers.wrapping import wrapped
-from league.errors import ConfigError, EnvironmentMismatch, LeagueError, cause
+from league.errors import ConfigError, EnvironmentMismatch, LeagueError, cause, no_exit
 from league.interface import AgentInterface, Interface
 from league.refs import check_slug
 from league.spaces import Discrete, MultiDiscrete
@@ -98,7 +98,8 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
     # Copied, because some environments change their arguments.
     kwargs = copy.deepcopy(config.kwargs) | ({} if render_mode is None else {"render_mode": render_mode})
     try:
-        env = constructor(**kwargs)
+        with no_exit:
+            env = constructor(**kwargs)
     except LeagueError:
         raise
     except Exception as error:
@@ -135,7 +136,8 @@ def _refuses_arguments(constructor: Callable[..., Any], kwargs: Mapping[str, Any
 
 def _spaces(env: Any, agent: str, entry_point: str) -> AgentInterface:
     try:
-        return agent_interface(env, agent)
+        with no_exit:
+            return agent_interface(env, agent)
     except LeagueError:
         raise
     except Exception as error:
@@ -243,7 +245,8 @@ def _policies_from_function(entry_point: str, agents: list[str], folder: str | N
     mapped = {}
     for agent in agents:
         try:
-            mapped[agent] = check_slug("policy", function(agent))
+            with no_exit:
+                mapped[agent] = check_slug("policy", function(agent))
         except Exception as error:
             raise ConfigError(
                 f"policies: {entry_point} returned no valid policy id for agent {agent!r}: {error}"

@@ -13,6 +13,7 @@ from league.environments.adapters import EnvAdapter, adapter_for, splitter
 from league.environments.building import agent_interface, build
 from league.environments.stepping import Indices
 from league.environments.vector.vector_env import VectorEnv
+from league.errors import no_exit
 from league.spaces.arrays import environment_actions
 
 
@@ -62,14 +63,15 @@ class EpisodeActions:
         interfaces = [agent_interface(stock, agent) for agent in stock.possible_agents]
         adapter = adapter_for(stock, [splitter(spaces.observation) for spaces in interfaces])
         try:
-            adapter.reset(int(self._seeds[env]))
-            for step in (*self._since(int(self._began[env])), *(() if further is None else (further,))):
-                rows = slice(*np.searchsorted(step.envs, [env, env + 1]))
-                # The agents of a vectorised environment have actions of one space, but for their bounds.
-                actions = environment_actions(step.actions[rows], interfaces[0].action)
-                adapter.step(list(zip(step.agents[rows].tolist(), actions, strict=True)))
+            with no_exit:
+                adapter.reset(int(self._seeds[env]))
+                for step in (*self._since(int(self._began[env])), *(() if further is None else (further,))):
+                    rows = slice(*np.searchsorted(step.envs, [env, env + 1]))
+                    # The agents of a vectorised environment have actions of one space, but for their bounds.
+                    actions = environment_actions(step.actions[rows], interfaces[0].action)
+                    adapter.step(list(zip(step.agents[rows].tolist(), actions, strict=True)))
         except BaseException:
-            with contextlib.suppress(Exception):
+            with contextlib.suppress(Exception), no_exit:
                 adapter.close()
             raise
         return adapter

@@ -11,7 +11,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
 
 from league.environments.apis import RLlibEnv
-from league.errors import InvalidReturn
+from league.errors import InvalidReturn, no_exit
 from league.spaces import ACTION_MASK, OBSERVATION
 from league.spaces.arrays import mask_size
 from league.spaces.conversion import from_gymnasium
@@ -41,11 +41,12 @@ def with_info_masks(env: Any, configuration: str) -> Any:
 
 def _finds_masks(env: Any) -> bool:
     try:
-        if all(_missing_mask(env, agent) is None for agent in env.possible_agents):
-            return False
-        returned = env.reset(seed=0)
-        infos = env.infos if isinstance(env, AECEnv) else returned[1]
-        return any(isinstance(info, Mapping) and ACTION_MASK in info for info in infos.values())
+        with no_exit:
+            if all(_missing_mask(env, agent) is None for agent in env.possible_agents):
+                return False
+            returned = env.reset(seed=0)
+            infos = env.infos if isinstance(env, AECEnv) else returned[1]
+            return any(isinstance(info, Mapping) and ACTION_MASK in info for info in infos.values())
     except Exception:
         # The same call fails again where its error is reported with the seed.
         return False

@@ -30,7 +30,7 @@ from league.environments.stepping import (
     without_action,
 )
 from league.environments.vector.vector_env import AgentRows
-from league.errors import InvalidReturn, LeagueError, ObservationError
+from league.errors import InvalidReturn, LeagueError, ObservationError, no_exit
 from league.registry.gateways import ForSimulators
 from league.spaces import inputs
 from league.spaces.arrays import environment_actions
@@ -150,16 +150,19 @@ class Lockstep(EpisodeStepping):
         return seconds
 
     def render(self, env: int, agent: str | None = None) -> NDArray:
-        return picture(self._envs[env].render(agent))
+        with no_exit:
+            return picture(self._envs[env].render(agent))
 
     def close(self) -> None:
-        for env in self._envs:
-            env.close()
+        with no_exit:
+            for env in self._envs:
+                env.close()
 
     def _timed(self, env: int, call: Callable[[Given], list[Report]], given: Given) -> list[Report]:
         self._since = perf_counter()
         self._busy = env
-        reports = call(given)
+        with no_exit:
+            reports = call(given)
         self._busy = None
         self._seconds[env] += perf_counter() - self._since
         return reports
@@ -215,7 +218,7 @@ class Lockstep(EpisodeStepping):
         """Recreate an environment, or raise the error after too many crashes."""
         self._crashes.count(env, int(self._seeds[env]), error)
         self._busy = None
-        with contextlib.suppress(Exception):
+        with contextlib.suppress(Exception), no_exit:
             self._envs[env].close()
         self._envs[env] = adapter_for(self._make(), self._splits)
 

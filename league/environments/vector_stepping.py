@@ -26,7 +26,7 @@ from league.environments.stepping import (
     without_action,
 )
 from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.errors import EnvironmentMismatch, LeagueError, one_line
+from league.errors import EnvironmentMismatch, LeagueError, no_exit, one_line
 from league.spaces import inputs
 
 
@@ -166,7 +166,8 @@ class VectorStepping(EpisodeStepping):
     def _timed(self, envs: Indices, call: Callable[[], Sequence[AgentRows]]) -> Sequence[AgentRows]:
         self._since = perf_counter()
         self._busy = envs
-        rows = call()
+        with no_exit:
+            rows = call()
         self._busy = no_envs()
         self._seconds[envs] += (perf_counter() - self._since) / len(envs)
         return rows

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.entry_points import import_entry_point
-from league.errors import ConfigError, EnvironmentMismatch
+from league.errors import ConfigError, EnvironmentMismatch, no_exit
 from league.policies.draws import Generators
 from league.policies.policy import Actions, Arrays, MalformedAction
 from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, Leaf, Space, beside_mask
@@ -68,7 +68,9 @@ class Bot:
     ) -> Actions:
         """Choose actions for a batch; see `Policy.act`. If the bot raises for a row, the row has a fault."""
         if self._batched:
-            return Actions(np.asarray(self._bot(self._observation(observations), **self._optional(observations, rng))))
+            with no_exit:
+                chosen = self._bot(self._observation(observations), **self._optional(observations, rng))
+            return Actions(np.asarray(chosen))
         rows = len(next(iter(observations.values())))
         state = (state or self.initial_state(rows)) if self._remembers else None
         after = None if state is None else {INSTANCE: state[INSTANCE].copy()}
@@ -77,13 +79,14 @@ class Bot:
         for row in range(rows):
             row_observations = {name: array[row] for name, array in observations.items()}
             try:
-                if after is not None and isinstance(after[INSTANCE][row], int):
-                    after[INSTANCE][row] = self._bot()  # at the first action in an episode
-                act = self._bot if after is None else after[INSTANCE][row].act
-                action = act(
-                    self._observation(row_observations),
-                    **self._optional(row_observations, None if rng is None else rng[row]),
-                )
+                with no_exit:
+                    if after is not None and isinstance(after[INSTANCE][row], int):
+                        after[INSTANCE][row] = self._bot()  # at the first action in an episode
+                    act = self._bot if after is None else after[INSTANCE][row].act
+                    action = act(
+                        self._observation(row_observations),
+                        **self._optional(row_observations, None if rng is None else rng[row]),
+                    )
                 actions[row] = _action(action, self._action)
             except MemoryError:
                 raise

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from league.errors import InvalidInput, LeagueError, NotFound, one_line
+from league.errors import InvalidInput, LeagueError, NotFound, one_line, raised_at
 
 USAGE_ERROR = 2
 FAILURE = 1
@@ -183,4 +183,9 @@ def run() -> None:
     except SystemExit as end:
         if end.code == signal.SIGTERM:  # Ray's handler exits with the number of the signal.
             sys.exit(TERMINATED)
+        if place := raised_at(end):  # of a user's code
+            from policy_league.cli.output import complain
+
+            complain(f"league: {place} called sys.exit()")
+            sys.exit(FAILURE)
         raise

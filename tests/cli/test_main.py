@@ -1,4 +1,5 @@
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ import pytest
 import typer
 
 from league.registry.registry import Registry
+from policy_league.cli import main
 from policy_league.cli.main import SUBCOMMANDS, app
 from tests.support.command import League
 
@@ -165,3 +167,13 @@ def test_json_is_alone_on_stdout_although_the_environment_prints(league_process:
     result = league_process("check-env", str(config), "--json")
     assert result.json["policies"], result.out
     assert "hello" in result.err
+
+
+def test_code_of_a_user_does_not_end_a_command_silently(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(main, "app", lambda: sys.exit(0))
+    with pytest.raises(SystemExit) as end:
+        main.run()
+    assert end.value.code == 1
+    assert re.fullmatch(rf"league: {re.escape(__file__)}, line \d+ called sys\.exit\(\)\n", capsys.readouterr().err)

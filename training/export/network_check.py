@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from league.config.league import LeagueConfig
-from league.errors import ConfigError, last_of_user, one_line, raised_at
+from league.errors import ConfigError, last_of_user, no_exit, one_line, raised_at
 from league.interface import Interface
 from league.policies.actions import to_environment
 from league.random.seeds import derive, generator
@@ -48,7 +48,8 @@ def check_network(config: LeagueConfig, interface: Interface) -> None:
         assert isinstance(network, OwnNetwork)
         inputs = {name: observations[name] for name in network.names}
         try:
-            features = network({name: torch.from_numpy(array) for name, array in inputs.items()})
+            with no_exit:
+                features = network({name: torch.from_numpy(array) for name, array in inputs.items()})
             problem = _problem(features, len(next(iter(inputs.values()))), network.width)
             if problem is None and features.requires_grad:
                 features.sum().backward()

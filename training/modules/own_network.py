@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from league.entry_points import import_entry_point
-from league.errors import ConfigError, cause
+from league.errors import ConfigError, cause, no_exit
 from league.spaces import ACTION_MASK
 from training.modules.encoder import RunningNormalization, rounds_factors
 
@@ -30,7 +30,8 @@ class OwnNetwork(nn.Module):
         spaces = {name: part for name, part in sorted(space.spaces.items()) if name != ACTION_MASK}
         make = import_entry_point(NETWORK, entry_point)
         try:
-            network = make(gymnasium.spaces.Dict(spaces), **kwargs)
+            with no_exit:
+                network = make(gymnasium.spaces.Dict(spaces), **kwargs)
         except Exception as error:
             raise ConfigError(f"{NETWORK}: {entry_point} cannot be created{cause(error)}") from error
         if not isinstance(network, nn.Module):

@@ -9,7 +9,7 @@ from statistics import fmean
 from typing import Any
 
 from league.entry_points import import_entry_point
-from league.errors import ConfigError, LeagueError, cause
+from league.errors import ConfigError, LeagueError, cause, no_exit
 from league.interface import Interface
 from league.registry.storage.rows import VersionRow
 from training.sampling.play_metrics import PlayedEpisodes
@@ -53,7 +53,8 @@ class Callbacks:
         for entry_point in entry_points:
             create = callback_class(entry_point)
             try:
-                self._instances[entry_point] = create()
+                with no_exit:
+                    self._instances[entry_point] = create()
             except Exception as error:
                 raise ConfigError(f"{CALLBACKS}: {entry_point} cannot be created{cause(error)}") from error
         self._agents = tuple(interface.agents)
@@ -110,7 +111,8 @@ class Callbacks:
             if method is None or self.error is not None:
                 continue
             try:
-                metrics |= _metrics(method(argument))
+                with no_exit:
+                    metrics |= _metrics(method(argument))
             except Exception as error:
                 self.error = LeagueError(
                     f"{CALLBACKS}: {name}.{hook} raises{cause(error)}; training ended, and its state is published:"

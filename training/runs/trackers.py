@@ -24,7 +24,7 @@ from typing import Any, Protocol, Self
 
 from league.config.training import TrackerName
 from league.entry_points import import_entry_point
-from league.errors import ConfigError, one_line
+from league.errors import ConfigError, no_exit, one_line
 from league.registry.registry import Registry
 from league.registry.storage.manifest import TRAINING
 from league.registry.storage.rows import RunState, StrengthRow, VersionRow
@@ -152,10 +152,11 @@ class _Queue:
         tracker: Tracker | None = None
         while (report := self._reports.get()) is not None:
             try:
-                if tracker is None:
-                    tracker = (OPEN.get(self._name) or import_entry_point(KEY, self._name))(self._run)
-                assert tracker is not None
-                report(tracker)
+                with no_exit:
+                    if tracker is None:
+                        tracker = (OPEN.get(self._name) or import_entry_point(KEY, self._name))(self._run)
+                    assert tracker is not None
+                    report(tracker)
             except Exception as error:  # a report must never end a run
                 self._failed(one_line(error, with_type=True))
 

@@ -21,7 +21,7 @@ from league.environments.conformance.observations import ObservationCheck, check
 from league.environments.conformance.openings import joined, measure_openings
 from league.environments.conformance.random_actions import RandomActions
 from league.environments.conformance.time_budget import TimeBudget
-from league.errors import EnvironmentMismatch, IllegalMask, one_line
+from league.errors import EnvironmentMismatch, IllegalMask, no_exit, one_line
 from league.interface import Interface
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import check_mask, mask_size
@@ -319,7 +319,8 @@ def _check_report(agent: str, report: Report, found: Examination) -> None:
 def _check_state(adapter: EnvAdapter, found: Examination) -> None:
     """Centralised learners need a global state of a fixed size."""
     try:
-        raw_state = adapter.state()
+        with no_exit:
+            raw_state = adapter.state()
         state = None if raw_state is None else np.asarray(raw_state, dtype=np.float32)
     except Exception as error:
         reason = one_line(error, with_type=True)

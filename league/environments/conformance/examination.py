@@ -22,7 +22,7 @@ from league.environments.conformance.time_budget import TimeBudget
 from league.environments.implementation import implementation
 from league.environments.vector.equality import compare
 from league.environments.vector.measurement import steps_per_second
-from league.errors import InvalidReturn, LeagueError, cause, one_line, raised_at
+from league.errors import InvalidReturn, LeagueError, cause, no_exit, one_line, raised_at
 from league.interface import Interface
 from league.spaces import Box, Discrete, MultiDiscrete
 
@@ -61,9 +61,10 @@ def examine(
     """
     examination, budget = Examination(), TimeBudget(seconds, progress)
     try:
-        examination.implementation = implementation(config.environment).reason
-        env = build(config.environment)
-        interface = describe(env, config)
+        with no_exit:
+            examination.implementation = implementation(config.environment).reason
+            env = build(config.environment)
+            interface = describe(env, config)
     except LeagueError as error:
         examination.add("fault", str(error))
         return examination
@@ -89,7 +90,8 @@ def examine(
         return examination
     examiner = Examiner(env, interface, config, examination, steps, budget)
     try:
-        examiner.examine(episodes, seed)
+        with no_exit:
+            examiner.examine(episodes, seed)
     except InvalidReturn as error:
         examination.add("fault", f"{error} ({examiner.place})")
     except LeagueError as error:
@@ -117,7 +119,7 @@ def _explained(error: Exception, config: LeagueConfig, seed: int, place: str) ->
         bare = config.model_copy(update={"environment": config.environment.model_copy(update={"wrappers": ()})})
         with contextlib.suppress(Exception):
             try:
-                with contextlib.closing(build(bare.environment)) as env:
+                with no_exit, contextlib.closing(build(bare.environment)) as env:
                     interface = describe(env, bare)
                     Examiner(env, interface, bare, Examination(), None, TimeBudget(BARE_SECONDS)).examine(1, seed)
             except InvalidReturn as returned:
@@ -132,12 +134,13 @@ def _compare_vectorised(config: EnvironmentConfig, interface: Interface, found: 
     if vector is None:
         return
     try:
-        comparison = compare(config, vector(COMPARED_COPIES, **config.kwargs), COMPARED_STEPS, seed)
-        if comparison.difference is not None:
-            found.add("fault", f"the vectorised environment differs: {comparison.difference}")
-            return
-        actions = [spaces.action for spaces in interface.agents.values()]
-        rate = steps_per_second(vector(MEASURED_COPIES, **config.kwargs), actions, seed, MEASURED_SECONDS)
+        with no_exit:
+            comparison = compare(config, vector(COMPARED_COPIES, **config.kwargs), COMPARED_STEPS, seed)
+            if comparison.difference is not None:
+                found.add("fault", f"the vectorised environment differs: {comparison.difference}")
+                return
+            actions = [spaces.action for spaces in interface.agents.values()]
+            rate = steps_per_second(vector(MEASURED_COPIES, **config.kwargs), actions, seed, MEASURED_SECONDS)
     except Exception as error:
         found.add("fault", f"the vectorised environment raised an exception: {one_line(error, with_type=True)}")
         return
@@ -155,7 +158,7 @@ def _run_pettingzoo_tests(config: EnvironmentConfig, found: Examination, budget:
     budget.report("PettingZoo's API test")
     with contextlib.closing(build(config)) as env:
         try:
-            with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            with no_exit, warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
                 warnings.simplefilter("ignore")
                 if isinstance(env, AECEnv):
                     api_test(env, num_cycles=CYCLES)

@@ -18,7 +18,7 @@ from supersuit.lambda_wrappers.reward_lambda import aec_reward_lambda
 from league.config.environment import WrapperConfig
 from league.entry_points import import_entry_point
 from league.environments.wrappers.transforms import Transform, channel, transform
-from league.errors import ConfigError, cause, one_line
+from league.errors import ConfigError, cause, no_exit, one_line
 
 
 class BatchedWrappers(BaseParallelWrapper):
@@ -163,7 +163,8 @@ def _stock(env: AECEnv | ParallelEnv, wrapper: WrapperConfig, position: int) -> 
 def _own(env: AECEnv | ParallelEnv, wrapper: WrapperConfig, where: str) -> AECEnv | ParallelEnv:
     api = AECEnv if isinstance(env, AECEnv) else ParallelEnv
     try:
-        made = import_entry_point(where, wrapper.name)(env, **wrapper.kwargs)
+        with no_exit:
+            made = import_entry_point(where, wrapper.name)(env, **wrapper.kwargs)
     except ConfigError:
         raise
     except Exception as error:

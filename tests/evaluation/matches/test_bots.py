@@ -48,6 +48,7 @@ def test_an_exception_forfeits_the_game_in_which_it_occurs() -> None:
     ("name", "sentence"),
     [
         ("Failing", r"by an exception \(the first: RuntimeError: no idea at bots.py, line {RuntimeError}\)"),
+        ("Leaving", r"by an exception \(the first: ExitCalled: sys.exit\('bye'\) .* at bots.py, line {sys.exit}\)"),
         ("failing_at_once", r"by an exception \(the first: ValueError: cannot reshape .* at bots.py, line {reshape}\)"),
         ("taken", r"by an illegal action \(the first: action (\d), legal: (?!.*\1.*\))[\d, ]*\)"),
         ("text", r"by an output that is no action \(the first: the bot returned str 'left': expected int64 \[\]\)"),
@@ -56,9 +57,8 @@ def test_an_exception_forfeits_the_game_in_which_it_occurs() -> None:
 def test_forfeits_are_reported_with_the_first_fault(name: str, sentence: str) -> None:
     """An exception with the line of the bot that raised it, an action with those that were legal."""
     lines = Path(bots.__file__).read_text().splitlines()
-    places = {
-        word: str(1 + next(i for i, line in enumerate(lines) if word in line)) for word in ("RuntimeError", "reshape")
-    }
+    words = ("RuntimeError", "sys.exit", "reshape")
+    places = {word: str(1 + next(i for i, line in enumerate(lines) if word in line)) for word in words}
     for word, line in places.items():
         sentence = sentence.replace(f"{{{word}}}", line)
     bot = f"script:{MODULE}:{name}"

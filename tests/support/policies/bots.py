@@ -1,5 +1,6 @@
 """Bots for tests, which are contestants in tic-tac-toe: `script:tests.support.policies.bots:NAME`."""
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,15 @@ class Failing(Alternating):
         if self.turn == 3:
             raise RuntimeError("no idea")
         return action
+
+
+class Leaving(Alternating):
+    """Ends the program at the third action of an episode."""
+
+    def act(self, observation: NDArray, action_mask: NDArray) -> int:
+        if self.turn == 2:
+            sys.exit("bye")
+        return super().act(observation, action_mask)
 
 
 def failing_at_once(observation: NDArray, action_mask: NDArray) -> NDArray:
