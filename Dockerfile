@@ -27,6 +27,8 @@ RUN groupadd --gid 1000 league && useradd --uid 1000 --gid league --create-home 
     && install --directory --owner league --group league /league
 ENV PATH=/opt/league/bin:$PATH \
     PYTHONUNBUFFERED=1 \
+    ORT_DISABLE_TELEMETRY=1 \
+    RAY_USAGE_STATS_ENABLED=0 \
     LEAGUE_HOME=/league
 WORKDIR /league
 USER 1000:1000

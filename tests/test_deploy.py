@@ -15,6 +15,7 @@ import pytest
 import yaml
 from packaging.utils import canonicalize_name
 
+from league import REPORTS_OFF
 from league.settings import Storage
 from policy_league.configs.bundled import names
 from policy_league_client import __version__
@@ -426,6 +427,13 @@ def test_serving_and_evaluation_import_no_dependency_of_training() -> None:
     process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert process.returncode == 0, process.stderr
     assert set(process.stdout.split()) & (TRAINING | {"training"}) == set()
+
+
+@pytest.mark.parametrize("file", ["deploy.yaml", "deploy/kuberay.yaml", "deploy/kuberay-training.yaml", "Dockerfile"])
+def test_libraries_report_their_use_nowhere(file: str) -> None:
+    text = (ROOT / file).read_text()
+    for name in ("ORT_DISABLE_TELEMETRY", "RAY_USAGE_STATS_ENABLED"):
+        assert re.search(rf'{name}(=|, value: ")({REPORTS_OFF[name]})\b', text)
 
 
 def test_the_container_images_have_the_deployed_tags() -> None:

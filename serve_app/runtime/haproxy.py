@@ -80,7 +80,6 @@ def environment(directory: Path) -> dict[str, str]:
         "RAY_worker_niceness": "0",
         worker_start.WORKER_HOOK: f"{worker_start.__name__}.{worker_start.prepare.__name__}",
         "RAY_AUTH_MODE": "token",
-        "RAY_USAGE_STATS_ENABLED": "0",
         # Inference in a replica uses one thread.
         "OMP_NUM_THREADS": "1",
         # Otherwise each thread keeps buffers of messages of megabytes for the next ones.
