@@ -49,7 +49,7 @@ def stronger(shares: tuple[float, ...], elo: float, model: str = "normalized") -
         deviation = float(np.sqrt(p @ (CELLS - mean) ** 2))
         return (mean - 0.5) / deviation - elo / ELO_PER_EFFECT * np.sqrt(2)
 
-    return _tilted(shares, brentq(gap, -9, 9))
+    return _tilted(shares, brentq(gap, -30, 30))
 
 
 def _tilted(shares: tuple[float, ...], theta: float) -> Floats:

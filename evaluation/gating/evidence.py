@@ -200,7 +200,7 @@ def confirmation(contest: Contest) -> Confirmation | None:
     if len(matches) < schedule.length:
         return None
     counts = cell_counts(matches, contest.candidate)
-    estimate = elo_estimate(counts, "logistic")
+    estimate = elo_estimate(counts)
     return Confirmation(
         verdict=verdict.id,
         candidate=contest.candidate,

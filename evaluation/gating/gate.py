@@ -227,7 +227,7 @@ def decide(
         unique_games=None,
         counts=tuple(int(n) for n in counts[blocks - 1]) if blocks else (0,) * (2 * comparisons + 1),
         curve=tuple(float(llr) for llr in curve[:blocks]),
-        estimate=elo_estimate(counts[blocks - 1], "logistic") if blocks else None,
+        estimate=elo_estimate(counts[blocks - 1]) if blocks else None,
     )
 
 

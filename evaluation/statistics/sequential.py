@@ -294,15 +294,14 @@ def gsprt_llr(counts: ArrayLike, elo0: float, elo1: float, model: Model) -> Floa
     return np.asarray(llr[inverse.reshape(-1)].reshape(total.shape))
 
 
-def elo_estimate(counts: ArrayLike, model: Model, confidence: float = 0.95) -> EloEstimate:
-    """Elo difference estimated from one series of blocks, with a normal interval.
+def elo_estimate(counts: ArrayLike, confidence: float = 0.95) -> EloEstimate:
+    """Difference in logistic Elo estimated from one series of blocks, with a normal interval.
 
     The interval is that of the mean block score, `mu ± z sigma / sqrt(N)`, converted to Elo. After a sequential stop it
     is conditional on having stopped, and optimistic for the winner.
 
     Args:
         counts: Blocks per cell, worst first, shape `(2n + 1,)`.
-        model: Unit of the result.
         confidence: Coverage of the interval.
 
     Raises:
@@ -312,11 +311,7 @@ def elo_estimate(counts: ArrayLike, model: Model, confidence: float = 0.95) -> E
     mean, sigma = _moments(cells)
     number = np.maximum(cells, EMPTY_CELL).sum()
     half = float(ndtri(0.5 + confidence / 2)) * sigma / math.sqrt(number)
-    scores = np.array([mean, mean - half, mean + half])
-    if model == "logistic":
-        elos = elo_of(np.clip(scores, 0.0, 1.0))
-    else:
-        elos = (scores - 0.5) / (sigma * math.sqrt(_games(cells.shape[0]))) * ELO_PER_EFFECT
+    elos = elo_of(np.clip([mean, mean - half, mean + half], 0.0, 1.0))
     return EloEstimate(*(float(x) for x in elos))
 
 

@@ -11,9 +11,9 @@ from scipy.optimize import brentq
 
 from evaluation.gating.gate import SequentialMonitor, SequentialTest, decide, decide_matches, observe, shadow_shortfall
 from evaluation.matches.game_records import unique_games
-from evaluation.statistics.sequential import bounds, elo_estimate, expected_games, gsprt_llr
+from evaluation.statistics.sequential import ELO_PER_EFFECT, bounds, expected_games, gsprt_llr
 from league.config.gate import GateConfig
-from league.results.records import Game, Match
+from league.results.records import GAMES_PER_BLOCK, Game, Match
 from tests.support.closeness import close
 
 GATE = GateConfig(elo0=0, elo1=60, max_blocks=400)
@@ -168,7 +168,10 @@ def test_a_challenger_at_h1_is_mostly_promoted(shares: tuple[float, ...]) -> Non
 
 def _tilted(shares: np.ndarray, elo: float) -> np.ndarray:
     def distance(theta: float) -> float:
-        return float(elo_estimate(_weighted(shares, theta) * 1e9, "normalized").elo - elo)
+        weights = _weighted(shares, theta)
+        mean = weights @ CELLS
+        effect = (mean - 0.5) / np.sqrt(GAMES_PER_BLOCK * weights @ (CELLS - mean) ** 2)
+        return float(ELO_PER_EFFECT * effect - elo)
 
     return _weighted(shares, brentq(distance, -3, 3))
 
