@@ -327,8 +327,8 @@ def influence(
     except (ObservationError, ValueError) as error:
         return f"fails on a single observation: {one_line(error)}"
     cause = (
-        "its rows influence each other, as with a softmax or statistics over axis 0, or with attention or recurrence"
-        " that take axis 0 for time (batch_first)"
+        "its rows influence each other, as with a softmax, statistics or dynamic quantization over axis 0, or with"
+        " attention or recurrence that take axis 0 for time (batch_first)"
     )
     for outputs, where, reason in (
         (again, "in a second run", BY_CHANCE),
