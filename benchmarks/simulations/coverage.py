@@ -86,7 +86,7 @@ def _of_verdicts(draws: int) -> Iterator[Target]:
     for elo in (0.0, 30.0, 60.0, 200.0):
         shares = stronger(EQUALS["decisive"], elo)
         truth, bounds = float(elo_of(float(shares @ CELLS))), list[Bounds]()
-        for _ in range(draws // 2):
+        for _ in range(draws):
             scores: list[float] = []
             while (decision := decide(settings, scores)).outcome is None:
                 scores += CELLS[rng.choice(5, p=shares, size=100)].tolist()
@@ -148,7 +148,7 @@ def _of_populations(draws: int) -> Iterator[Target]:
                         for (i, j), cells in shares.items()
                     },
                 )
-                for _ in range(draws // 2)
+                for _ in range(draws)
             ]
             of_kind = {
                 "α-Rank": [estimate.alpha_rank for estimate in estimates if estimate],
@@ -185,7 +185,7 @@ def _of_runs(draws: int) -> Iterator[Target]:
         # P(X + 0.1 > Y) for uniform X and Y is 1 - (1 - 0.1)² / 2.
         improvement = 1 - 0.9**2 / 2
         held = np.zeros(2)
-        for number in range(draws // 2):
+        for number in range(draws):
             ours, theirs = _scores(rng, runs, tasks), _scores(rng, runs, tasks)
             of_iqm = stratified_bootstrap(iqm, ours, resamples=RESAMPLES, seed=number)
             of_both = stratified_bootstrap(
@@ -194,7 +194,7 @@ def _of_runs(draws: int) -> Iterator[Target]:
             held += of_iqm.low <= truth <= of_iqm.high, of_both.low <= improvement <= of_both.high
         case = f"{runs} runs of {tasks} {'tasks' if tasks > 1 else 'task'}"
         for name, number in zip(("IQM", "probability of improvement"), held, strict=True):
-            yield _target(f"{name}: {case}", float(number) / (draws // 2))
+            yield _target(f"{name}: {case}", float(number) / draws)
 
 
 def _scores(rng: np.random.Generator, runs: int, tasks: int) -> Floats:
@@ -207,7 +207,7 @@ def _of_teams(draws: int) -> Iterator[Target]:
     held = []
     for matches in numbers:
         rng, tables = np.random.default_rng(11), []
-        for _ in range(draws // 2):
+        for _ in range(draws):
             pairs = [*combinations(names, 2), *((name, name) for name in names)]
             played = [_team_match(pair, rng.normal(size=GAMES_PER_BLOCK)) for pair in pairs for _ in range(matches)]
             table = cross_play_table(names, played)
