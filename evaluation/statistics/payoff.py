@@ -105,13 +105,18 @@ def crossed_interval(values: Floats, confidence: float = 0.95) -> Difference:
     mean = float(values.mean())
     if min(values.shape) < 2:
         return Difference(mean, None, None)
-    parts = [float(np.var(values.mean(axis=1 - axis), ddof=1)) / values.shape[axis] for axis in (0, 1)]
+    half = _half_width([values.mean(axis=1).tolist(), values.mean(axis=0).tolist()], confidence)
+    return Difference(mean, mean - half, mean + half)
+
+
+def _half_width(samples: Sequence[Sequence[float]], confidence: float = 0.95) -> float:
+    """Half the width of Student's interval for the sum of the means of independent samples of at least two values."""
+    parts = [float(np.var(sample, ddof=1)) / len(sample) for sample in samples]
     variance = sum(parts)
     if variance == 0:
-        return Difference(mean, mean, mean)
-    freedom = variance**2 / sum(part**2 / (number - 1) for part, number in zip(parts, values.shape, strict=True))
-    half = float(stdtrit(freedom, 0.5 + confidence / 2)) * math.sqrt(variance)
-    return Difference(mean, mean - half, mean + half)
+        return 0.0
+    freedom = variance**2 / sum(part**2 / (len(sample) - 1) for part, sample in zip(parts, samples, strict=True))
+    return float(stdtrit(freedom, 0.5 + confidence / 2)) * math.sqrt(variance)
 
 
 Row = tuple[float | None, ...]
@@ -201,11 +206,11 @@ def _estimate(values: Sequence[float]) -> Estimate | None:
 
 
 def _stratified(teams: Sequence[Sequence[float]]) -> Estimate | None:
-    """Mean over teams of their means, ± 1.96 combined standard errors."""
+    """Mean over teams of their means, with Student's interval."""
     if not teams:
         return None
     mean = float(np.mean([np.mean(values) for values in teams]))
     if any(len(values) < 2 for values in teams):
         return Estimate(mean, None, None)
-    error = float(np.sqrt(sum(np.var(values, ddof=1) / len(values) for values in teams))) / len(teams)
-    return Estimate(mean, mean - 1.96 * error, mean + 1.96 * error)
+    half = _half_width(teams) / len(teams)
+    return Estimate(mean, mean - half, mean + half)
