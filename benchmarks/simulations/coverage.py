@@ -212,8 +212,8 @@ def _of_teams(draws: int) -> Iterator[Target]:
             played = [_team_match(pair, rng.normal(size=GAMES_PER_BLOCK)) for pair in pairs for _ in range(matches)]
             table = cross_play_table(names, played)
             cells = [_holds(cell, 0.0) for row in table.returns for cell in row if cell is not None]
-            own, mixed = (_holds(estimate, 0.0) for estimate in (table.own, table.mixed) if estimate is not None)
-            tables.append((np.mean(cells), own, mixed))
+            diagonal, mixed = (_holds(estimate, 0.0) for estimate in (table.own, table.mixed) if estimate is not None)
+            tables.append((np.mean(cells), diagonal, mixed))
         held.append(np.mean(tables, axis=0))
     for name, shares in zip(("cell", "own", "mixed"), np.transpose(held).tolist(), strict=True):
         yield _target(f"cross-play, {name}: {', '.join(map(str, numbers))} matches a pair", *shares)

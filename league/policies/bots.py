@@ -69,8 +69,8 @@ class Bot:
         """Choose actions for a batch; see `Policy.act`. If the bot raises for a row, the row has a fault."""
         if self._batched:
             with no_exit:
-                chosen = self._bot(self._observation(observations), **self._optional(observations, rng))
-            return Actions(np.asarray(chosen))
+                output = self._bot(self._observation(observations), **self._optional(observations, rng))
+            return Actions(np.asarray(output))
         rows = len(next(iter(observations.values())))
         state = (state or self.initial_state(rows)) if self._remembers else None
         after = None if state is None else {INSTANCE: state[INSTANCE].copy()}
