@@ -1,6 +1,5 @@
 """The exceptions, which the client raises too, and what only the program does with them."""
 
-import signal
 import sysconfig
 import traceback
 from collections.abc import Iterable, Mapping
@@ -33,13 +32,23 @@ class _NoExit:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # Ray's handler of SIGTERM exits with the number of the signal.
-        if isinstance(error, SystemExit) and error.code != signal.SIGTERM:
+        # Ray's handlers of SIGTERM exit wherever the process is.
+        if isinstance(error, SystemExit) and raised_by(error)[0] != "ray":
             code = "" if error.code is None else repr(error.code)
             raise ExitCalled(f"sys.exit({code}) was called").with_traceback(trace) from error
 
 
 no_exit = _NoExit()
+
+
+def raised_by(error: BaseException) -> tuple[str, str]:
+    """Return the package that raised an error that was caught, and where, as `FILE, line N`.
+
+    Where a package is installed does not say whose it is: environments are stacked, and users have folders of their
+    own.
+    """
+    *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+    return str(frame.f_globals.get("__name__")).partition(".")[0], f"{frame.f_code.co_filename}, line {line}"
 
 
 def raised_at(error: BaseException) -> str | None:

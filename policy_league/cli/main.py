@@ -10,12 +10,14 @@ from typing import Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from league.errors import InvalidInput, LeagueError, NotFound, one_line, raised_at
+from league.errors import OWN_PACKAGES, InvalidInput, LeagueError, NotFound, one_line, raised_by
 
 USAGE_ERROR = 2
 FAILURE = 1
 TERMINATED = 143
 """Exit code of a process ended by SIGTERM: 128 + 15."""
+ENDING = {"click", "typer", *OWN_PACKAGES}
+"""Packages that end a command."""
 
 
 class Subcommand(NamedTuple):
@@ -183,7 +185,8 @@ def run() -> None:
     except SystemExit as end:
         if end.code == signal.SIGTERM:  # Ray's handler exits with the number of the signal.
             sys.exit(TERMINATED)
-        if place := raised_at(end):  # of a user's code
+        package, place = raised_by(end)
+        if package not in ENDING:
             from policy_league.cli.output import complain
 
             complain(f"league: {place} called sys.exit()")

@@ -1,6 +1,5 @@
 """An environment that ends the program, as games do when their window closes, raises an exception like any other."""
 
-import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
+from ray._private.worker import raise_sys_exit_with_custom_error_message
 
 from league.config.league import LeagueConfig
 from league.entry_points import import_module
@@ -94,7 +94,7 @@ def test_a_module_that_exits_cannot_be_imported(tmp_path: Path) -> None:
 
 def test_what_else_ends_a_process_does_so() -> None:
     with pytest.raises(SystemExit), no_exit:
-        raise SystemExit(signal.SIGTERM)
+        raise_sys_exit_with_custom_error_message("The process receives a SIGTERM.", exit_code=1)
     with pytest.raises(KeyboardInterrupt), no_exit:
         raise KeyboardInterrupt
     with pytest.raises(ExitCalled, match=r"^sys\.exit\(\) was called$") as exited, no_exit:
