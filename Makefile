@@ -71,7 +71,7 @@ check: setup
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/generate_sync_client.py --check
 	$(BIN)/python scripts/benchmark_page.py --check
-	$(BIN)/python scripts/check_names.py
+	$(BIN)/python -m scripts.checks
 
 fix: setup
 	$(BIN)/ruff format .

@@ -68,14 +68,17 @@ def read_pins(path: Path) -> dict[str, Version]:
     """Return package → version."""
     lines = (line.partition("#")[0].strip() for line in path.read_text().splitlines())
     requirements = [Requirement(line) for line in lines if line]
-    return {canonicalize_name(each.name): Version(str(each.specifier).removeprefix("==")) for each in requirements}
+    return {
+        canonicalize_name(requirement.name): Version(str(requirement.specifier).removeprefix("=="))
+        for requirement in requirements
+    }
 
 
 def lock(pins: dict[str, Version]) -> dict[str, list[str]]:
     """Return pin → digests of its files."""
     with ThreadPoolExecutor(8) as threads:
-        found = list(threads.map(lambda pin: digests(*pin), pins.items()))
-    return {f"{package}=={version}": each for (package, version), each in zip(pins.items(), found, strict=True)}
+        hashes = list(threads.map(lambda pin: digests(*pin), pins.items()))
+    return dict(zip((f"{package}=={version}" for package, version in pins.items()), hashes, strict=True))
 
 
 def write(name: str, locked: dict[str, list[str]]) -> None:
@@ -84,7 +87,7 @@ def write(name: str, locked: dict[str, list[str]]) -> None:
     for pin, hashes in locked.items():
         if not hashes:
             sys.exit(f"the index has no file of {pin} for Linux on x86-64")
-        parts.append(" \\\n".join([pin, *(f"    --hash=sha256:{each}" for each in sorted(hashes))]) + "\n")
+        parts.append(" \\\n".join([pin, *(f"    --hash=sha256:{digest}" for digest in sorted(hashes))]) + "\n")
     target = ROOT / "requirements" / name
     target.parent.mkdir(exist_ok=True)
     target.write_text("".join(parts))
@@ -95,8 +98,8 @@ def digests(package: str, version: Version) -> list[str]:
     """Return the SHA-256 of each wheel that fits, or of the sources if there is none."""
     files = [file for file in of_index(package) if not file.get("yanked")]
     wheels = [file for file in files if is_wheel_of(file["filename"], version)]
-    chosen = wheels or [file for file in files if is_source_of(file["filename"], version)]
-    return [file["hashes"]["sha256"] for file in chosen]
+    sources = [file for file in files if is_source_of(file["filename"], version)]
+    return [file["hashes"]["sha256"] for file in wheels or sources]
 
 
 def of_index(package: str) -> list[dict[str, Any]]:
@@ -109,10 +112,10 @@ def of_index(package: str) -> list[dict[str, Any]]:
 def is_wheel_of(filename: str, version: Version) -> bool:
     """Return whether a file is a wheel of this version that CPython on Linux, x86-64, can install."""
     try:
-        _, found, _, tags = parse_wheel_filename(filename)
+        _, version_of_file, _, tags = parse_wheel_filename(filename)
     except InvalidWheelFilename:
         return False
-    return found == version and any(fits(tag.interpreter, tag.abi, tag.platform) for tag in tags)
+    return version_of_file == version and any(fits(tag.interpreter, tag.abi, tag.platform) for tag in tags)
 
 
 def fits(interpreter: str, abi: str, platform: str) -> bool:
@@ -164,7 +167,7 @@ def cuda_requirements(package: str, version: Version, extras: Iterable[str]) -> 
         environments = [
             {"extra": extra, "platform_system": "Linux", "sys_platform": "linux"} for extra in ("", *extras)
         ]
-        applies = required.marker is None or any(required.marker.evaluate(each) for each in environments)
+        applies = required.marker is None or any(required.marker.evaluate(environment) for environment in environments)
         if applies and required.name.startswith(CUDA_PACKAGES):
             yield required
 

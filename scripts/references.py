@@ -65,8 +65,8 @@ def documents_page() -> str:
         first, *entries = re.split(entry, text)
         for listed, description in zip(entries[::2], entries[1::2], strict=True):
             for field in listed.split(", "):
-                shown = f"`{field}`: {description}" if "[" in field else f"{description[0].upper()}{description[1:]}"
-                fields[field.partition("[")[0]]["description"] = shown
+                sentence = f"`{field}`: {description}" if "[" in field else f"{description[0].upper()}{description[1:]}"
+                fields[field.partition("[")[0]]["description"] = sentence
         if name == VerdictReport.__name__:
             schema["properties"] = {field: part for field, part in fields.items() if field not in LATER}
         parts.append(_schema(name, schema | {"description": first.strip()}))

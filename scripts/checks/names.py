@@ -1,20 +1,20 @@
-"""Fails on local variables whose names hide what they are: `found`, `each`, `own`, …
+"""No local variable has a name that hides what it is: `found`, `each`, `own`, …
 
 A name says what the value is, by a noun: `version`, `batch`, `legal_actions`.
 """
 
 import ast
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PACKAGES = (
     "benchmarks",
     "clients/python/policy_league_client",
     "evaluation",
     "league",
     "policy_league",
+    "scripts",
     "serve_app",
     "tests/support",
     "training",
@@ -24,16 +24,16 @@ VAGUE = frozenset(("found", "seen", "each", "own", "shown", "wanted", "given", "
 VAGUE |= {"rest", "mine", "known", "chosen", "taken", "begun"}
 
 
-def main() -> None:
-    """Print the place of each vague name, and exit with 1 if there is any."""
-    places = [
-        f"{path.relative_to(ROOT)}:{name.lineno}: {name.id}: name the local variable by a noun that says what it is"
-        for package in PACKAGES
-        for path in sorted((ROOT / package).rglob("*.py"))
-        if not any(part in str(path) for part in GENERATED)
-        for name in vague_names(ast.parse(path.read_text()))
-    ]
-    sys.exit("\n".join(places) or 0)
+def check_local_names() -> Iterator[str]:
+    """Yield the place of each vague name."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            if not any(part in str(path) for part in GENERATED):
+                for name in vague_names(ast.parse(path.read_text())):
+                    yield (
+                        f"{path.relative_to(ROOT)}:{name.lineno}: {name.id}: "
+                        "name the local variable by a noun that says what it is"
+                    )
 
 
 def vague_names(module: ast.Module) -> Iterator[ast.Name]:
@@ -46,7 +46,3 @@ def vague_names(module: ast.Module) -> Iterator[ast.Name]:
 
 def _field(statement: ast.stmt) -> ast.expr | None:
     return statement.target if isinstance(statement, ast.AnnAssign) else None
-
-
-if __name__ == "__main__":
-    main()

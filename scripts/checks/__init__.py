@@ -1,0 +1,1 @@
+"""What the linter and the type checker cannot see: names, layout, documentation and what a release consists of."""
