@@ -19,8 +19,8 @@ from benchmarks.harness import Quick, Target
 from benchmarks.leagues.served_league import served
 from benchmarks.load.elsewhere import Performance, beside
 from benchmarks.load.steps import Steps, step
+from benchmarks.processes import replica_processes
 from league.registry.registry import Registry
-from tests.support.servers.processes import replica_processes
 from tests.support.waiting import until
 
 APPEARED = 10.0

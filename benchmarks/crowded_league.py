@@ -1,6 +1,6 @@
 """How long do snapshots, page reads and new matches take with 200 versions and a million games?
 
-The league is that of `tests.support.leagues.crowded_league`, in an SQLite file. Snapshots are computed as by the
+The league is that of `benchmarks.leagues.crowded_league`, in an SQLite file. Snapshots are computed as by the
 evaluation service, in a process of their own, which computes them again after each of some matches between the best
 two versions. The processor time of the first ones includes its start. The time of new matches is that of playing chunks
 of a tournament and adding them to the ledger, with and without sums, in alternation.
@@ -22,6 +22,7 @@ import psutil
 from sqlalchemy import delete
 
 from benchmarks.harness import Quick, Target, in_rounds
+from benchmarks.leagues.crowded_league import LEAGUE, crowd
 from evaluation.matches.tournament import evaluate
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY
@@ -29,7 +30,6 @@ from league.registry.storage import rows
 from league.results import ledger
 from league.results.ledger import Ledger
 from league.subprocesses import RequestProcess
-from tests.support.leagues.crowded_league import LEAGUE, crowd
 
 READ_MS, NEWS_MS = 50.0, 2.0
 """The targets for a read, and for whether anything is new, in milliseconds."""

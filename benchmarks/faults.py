@@ -25,6 +25,7 @@ from statistics import median
 
 import numpy as np
 
+from benchmarks.attacks.slow_clients import slow_clients
 from benchmarks.harness import Parts, Quick, Target, chosen
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, promote, served
 from benchmarks.load.callers import WITH_RETRIES, WITHOUT_RETRIES, CallLog, call
@@ -32,7 +33,6 @@ from benchmarks.load.elsewhere import beside
 from benchmarks.load.http import post
 from benchmarks.load.overload import overload
 from league.registry.registry import Registry
-from tests.support.attacks.slow_clients import slow_clients
 from tests.support.waiting import until
 
 REPLICAS = 2

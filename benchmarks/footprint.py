@@ -19,8 +19,8 @@ import psutil
 
 from benchmarks.harness import Quick, Target
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, promote, served
+from benchmarks.processes import replica_processes
 from league.registry.registry import Registry
-from tests.support.servers.processes import replica_processes
 from tests.support.waiting import until
 
 LARGE = (448, 448)

@@ -11,16 +11,16 @@ locks              nightly runs whose lock connection is terminated while anothe
 
 from collections.abc import Callable, Iterator
 
+from benchmarks.attacks.confirmations import confirmations
+from benchmarks.attacks.databases import databases
+from benchmarks.attacks.large_bodies import large_bodies
+from benchmarks.attacks.lost_database import lost_database
+from benchmarks.attacks.lost_lock import lost_locks
+from benchmarks.attacks.numbered_versions import numbered_versions
+from benchmarks.attacks.unauthenticated import unauthenticated
 from benchmarks.harness import Parts, Quick, Target, chosen
 from benchmarks.leagues.served_league import served
 from serve_app.runtime.haproxy import free_ports
-from tests.support.attacks.confirmations import confirmations
-from tests.support.attacks.databases import databases
-from tests.support.attacks.large_bodies import large_bodies
-from tests.support.attacks.lost_database import lost_database
-from tests.support.attacks.lost_lock import lost_locks
-from tests.support.attacks.numbered_versions import numbered_versions
-from tests.support.attacks.unauthenticated import unauthenticated
 
 REPLICAS = 2
 

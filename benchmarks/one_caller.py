@@ -8,7 +8,7 @@ idle_connections  thousands of connections that are idle, or of which nothing ar
 
 Each attack is a module of benchmarks.attacks, which runs in a process of its own:
 
-    python -m tests.support.attacks.ATTACK URL GRPC_ADDRESS TOKEN
+    python -m benchmarks.attacks.ATTACK URL GRPC_ADDRESS TOKEN
 
 It prints a line when it has started, and attacks until it is killed. TOKEN is empty, or a key that allows one request
 per second. A stall is the longest wait of a probe during the attack minus that in a control run before it.
@@ -29,9 +29,9 @@ from benchmarks.harness import Parts, Quick, Target, chosen
 from benchmarks.leagues.served_league import ACTION, BODY, published
 from benchmarks.load.http import JSON
 from benchmarks.load.probe import measure
+from benchmarks.processes import replica_processes
 from serve_app.runtime.haproxy import free_ports
 from serve_app.runtime.launch import running
-from tests.support.servers.processes import replica_processes
 
 ATTACKS = ("grpc_messages", "websocket_pings", "idle_connections")
 NEED_ACCESS = ("websocket_pings",)
@@ -108,7 +108,7 @@ def attacked(
 @contextmanager
 def _attack(name: str, url: str, grpc_address: str, token: str) -> Iterator[None]:
     """Run the attack while the context is active."""
-    command = ["nice", sys.executable, "-m", f"tests.support.attacks.{name}", url, grpc_address, token]
+    command = ["nice", sys.executable, "-m", f"benchmarks.attacks.{name}", url, grpc_address, token]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         try:

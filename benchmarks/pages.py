@@ -21,10 +21,10 @@ import typer
 from playwright.sync_api import Browser, sync_playwright
 
 from benchmarks.harness import Quick, Target
+from benchmarks.leagues.crowded_league import LEAGUE, crowd
 from benchmarks.leagues.served_league import ACTION, BODY
 from benchmarks.load.http import measure
 from serve_app.runtime.launch import running
-from tests.support.leagues.crowded_league import LEAGUE, crowd
 
 CALL = 100
 """Maximum 95th percentile of the requests of each call, in milliseconds."""

@@ -29,8 +29,8 @@ from benchmarks.harness import Quick, Target
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, promote, served
 from benchmarks.load.elsewhere import Stage, beside
 from benchmarks.load.http import drive, measure
+from benchmarks.processes import haproxy_processes
 from league.registry.registry import Registry
-from tests.support.servers.processes import haproxy_processes
 from tests.support.waiting import until
 
 CLIENTS = 8

@@ -26,6 +26,7 @@ from sqlalchemy import insert, select
 from benchmarks.harness import ROOT, Parts, Quick, Target, chosen
 from benchmarks.leagues.served_league import LEAGUE, fill, promote
 from benchmarks.registry import server_load
+from benchmarks.registry.postgresql_replicas import standalone_replica
 from league.errors import NotReady
 from league.registry.registry import Registry
 from league.registry.storage.database import clock
@@ -33,7 +34,6 @@ from league.registry.storage.rows import AliasEvent, LeagueRow, ReadPosition, Se
 from league.registry.storage.tables import AliasTable, ReplicaTable, VersionTable
 from league.settings import Storage
 from tests.support.servers import postgresql
-from tests.support.servers.postgresql_replicas import standalone_replica
 
 SETTLED, MEASURED = 15.0, 60.0
 """Seconds."""

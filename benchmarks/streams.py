@@ -20,8 +20,8 @@ from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, published, se
 from benchmarks.load import http
 from benchmarks.load.elsewhere import beside
 from benchmarks.load.idle_streams import IdleStreams, run
+from benchmarks.registry.postgresql_replicas import standalone_replica
 from serve_app.runtime.launch import DEPLOY_YAML
-from tests.support.servers.postgresql_replicas import standalone_replica
 from tests.support.servers.scaling import scale
 from tests.support.servers.under_load import RayServer
 from tests.support.waiting import until

@@ -13,16 +13,14 @@ HEAVY = {"formats", "pages", "fuzz", "hostile", "exploitability", "training_nigh
 """Their imports need packages that only some tests have, or take long."""
 
 
-@pytest.mark.parametrize("name", sorted(set(entry.names()) - HEAVY))
-def test_each_benchmark_has_a_quick_form(name: str) -> None:
-    module = import_module(f"benchmarks.{name}")
-    assert inspect.signature(module.main).parameters["quick"].default is False
-    assert module.__doc__
-
-
-def test_the_help_lists_all_benchmarks() -> None:
+def test_every_benchmark_is_listed_and_has_a_quick_form(subtests: pytest.Subtests) -> None:
     listed = CliRunner().invoke(entry.app, ["--help"]).output
     assert [name for name in [*entry.names(), "all"] if f"  {name} " not in listed] == []
+    for name in sorted(set(entry.names()) - HEAVY):
+        with subtests.test(name):
+            module = import_module(f"benchmarks.{name}")
+            assert inspect.signature(module.main).parameters["quick"].default is False
+            assert module.__doc__
 
 
 def test_an_unknown_part_is_refused() -> None:

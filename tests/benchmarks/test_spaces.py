@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.generated_spaces import Case, Pipeline, pipeline
+from benchmarks.generated_spaces import Case, Pipeline, pipeline
 
 CASES, PARTS = 100, 5
 PUBLISHED = 25

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.attacks.confirmations import confirmations
+from benchmarks.attacks.invalid_requests import invalid_requests
+from benchmarks.attacks.large_bodies import large_bodies
+from benchmarks.attacks.lost_lock import lost_locks
+from benchmarks.attacks.unauthenticated import unauthenticated
 from benchmarks.harness import Target
 from benchmarks.leagues.served_league import served
 from benchmarks.one_caller import RATE, attacked
 from league.registry.registry import Registry
 from serve_app.runtime.haproxy import free_ports
-from tests.support.attacks.confirmations import confirmations
-from tests.support.attacks.invalid_requests import invalid_requests
-from tests.support.attacks.large_bodies import large_bodies
-from tests.support.attacks.lost_lock import lost_locks
-from tests.support.attacks.unauthenticated import unauthenticated
 
 pytestmark = pytest.mark.slow
 SECONDS = 2.0

@@ -12,12 +12,12 @@ from pathlib import Path
 import httpx
 import pytest
 
+from benchmarks.attacks.slow_clients import slow_clients
 from benchmarks.load.http import drive, post
 from league.registry.registry import Registry
 from league.settings import Storage
 from policy_league_client import Client
 from serve_app.runtime.launch import running
-from tests.support.attacks.slow_clients import slow_clients
 from tests.support.clients.actions import BOARD
 from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.under_load import ACTION, Load, deploy_file, load, processes, serving

@@ -1,6 +1,6 @@
 """One replica in a process of its own, without Ray but with its event loop and protocols, whose clock may be wrong.
 
-`python -m tests.support.servers.standalone_replica NAME HOME DATABASE_URL ARTIFACTS [--hours 1]` prints its port as
+`python -m benchmarks.registry.standalone_replica NAME HOME DATABASE_URL ARTIFACTS [--hours 1]` prints its port as
 soon as it is ready. Its log is the standard error.
 """
 

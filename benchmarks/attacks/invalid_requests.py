@@ -27,8 +27,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from benchmarks.harness import Target
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES
+from benchmarks.processes import replica_processes
 from serve_app.inference.stream_codec import encode_request as message_of
-from tests.support.servers.processes import replica_processes
 
 GROWTH = 5.0
 """Maximum growth of the replica's memory, in percent."""

@@ -8,8 +8,8 @@ import grpc
 import httpx
 
 from benchmarks.harness import Target
+from benchmarks.processes import replica_processes
 from serve_app.inference_protocol import open_inference_pb2 as messages
-from tests.support.servers.processes import replica_processes
 
 GROWTH = 10.0
 """Maximum growth of a replica, in MB."""

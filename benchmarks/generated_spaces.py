@@ -208,7 +208,7 @@ class Case:
         }  # fmt: skip
         document = {
             "league": f"case-{self.seed}",
-            "environment": {"entry_point": "tests.support.generated_spaces:environment", "kwargs": {"seed": self.seed}},
+            "environment": {"entry_point": "benchmarks.generated_spaces:environment", "kwargs": {"seed": self.seed}},
             "training": training,
         }
         return LeagueConfig.from_mapping(document)
@@ -296,7 +296,7 @@ class Game:
 class ParallelGame(Game, ParallelEnv):
     """A game with PettingZoo's Parallel API."""
 
-    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:  # noqa: ARG002
         """Start a game."""
         self.begin(seed)
         return self.observe_all(), {agent: {} for agent in AGENTS}
@@ -316,7 +316,7 @@ class ParallelGame(Game, ParallelEnv):
 class TurnGame(Game, AECEnv):
     """A game with PettingZoo's AEC API."""
 
-    def reset(self, seed: int | None = None, options: Any = None) -> None:
+    def reset(self, seed: int | None = None, options: Any = None) -> None:  # noqa: ARG002
         """Start a game."""
         self.begin(seed)
         self.rewards, self._cumulative_rewards = dict.fromkeys(AGENTS, 0.0), dict.fromkeys(AGENTS, 0.0)
@@ -354,7 +354,7 @@ class RLlibGame(Game, MultiAgentEnv):
         self.observation_spaces = {agent: observed for agent, (observed, _) in case.agents.items()}
         self.action_spaces = {agent: acted for agent, (_, acted) in case.agents.items()}
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:  # noqa: ARG002
         """Start a game."""
         self.begin(seed)
         return self.observe_all(), {}

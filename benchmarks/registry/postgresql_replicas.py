@@ -45,7 +45,7 @@ def standalone_replica(
 ) -> Iterator[StandaloneReplica]:
     """Run a replica. hours: how far its clock is ahead. prefix: a command that runs it, such as `ip netns exec`."""
     log = storage.home / f"{name}.log"
-    command = [*prefix, sys.executable, "-m", "tests.support.servers.standalone_replica", name, str(storage.home)]
+    command = [*prefix, sys.executable, "-m", "benchmarks.registry.standalone_replica", name, str(storage.home)]
     command += [database_url or storage.database_url, str(storage.artifacts), f"--hours={hours}"]
     with (
         log.open("w") as errors,

@@ -13,10 +13,10 @@ import httpx
 
 from benchmarks.harness import Target
 from benchmarks.leagues.served_league import ACTION, BODY, promote
+from benchmarks.registry.postgresql_replicas import StandaloneReplica, league_in_postgresql, standalone_replica
 from league.errors import NotReady
 from league.registry.registry import Registry
 from league.registry.replicas import LIVENESS_TIMEOUT
-from tests.support.servers.postgresql_replicas import StandaloneReplica, league_in_postgresql, standalone_replica
 
 WAIT = 0.5
 """Seconds that a promotion of a silent replica is awaited."""

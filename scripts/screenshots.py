@@ -1,6 +1,6 @@
 """Take the screenshots of docs/pages.md: every page of a league with real results.
 
-python -m tests.browser.screenshots [DIRECTORY]
+python -m scripts.screenshots [DIRECTORY]
 """
 
 import re
@@ -37,7 +37,7 @@ from tests.support.leagues.browser_leagues import (
 from tests.support.leagues.tictactoe import LEAGUE
 from training.runs.train import train
 
-IMAGES = Path(__file__).parents[2] / "docs" / "images"
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
 CONFIG = tictactoe.config(play={"opening_plies": 2, "num_envs": 8})
 SEED = 4
 COLORS = 160
@@ -104,8 +104,8 @@ def take(browser: Browser, url: str, picture: Picture, names: dict[str, str], di
     path = directory / f"{picture.name}.png"
     page.screenshot(path=path)
     page.close()
-    with Image.open(path) as taken:
-        taken.convert("RGB").quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
+    with Image.open(path) as image:
+        image.convert("RGB").quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
     print(f"{path} {path.stat().st_size // 1024} KiB")
 
 

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 
+from benchmarks.attacks.confirmations import forwarding
 from benchmarks.harness import Target
 from benchmarks.leagues.served_league import ACTION, BODY
+from benchmarks.registry.postgresql_replicas import StandaloneReplica, league_in_postgresql, standalone_replica
 from league.registry.registry import Registry
-from tests.support.attacks.confirmations import forwarding
-from tests.support.servers.postgresql_replicas import StandaloneReplica, league_in_postgresql, standalone_replica
 
 NAMESPACE, HERE, THERE = f"league-{os.getpid()}", "10.213.7.1", "10.213.7.2"
 NOTICED, USED = 10.0, 5.0
