@@ -57,7 +57,8 @@ serving := tests/serve_app tests/cli tests/policy_league_client tests/test_tutor
 training := tests/training tests/examples tests/test_environments.py tests/test_restore_parity.py
 evaluation := tests/evaluation tests/league tests/benchmarks tests/test_run_tests.py
 clusters := tests/cluster tests/clients
-PARTS := pages serving training evaluation clusters
+upgrade := tests/upgrade
+PARTS := pages serving training evaluation clusters upgrade
 
 test-slow: $(addprefix slow-,$(if $(TESTS),tests,$(or $(PART),$(PARTS))))
 

@@ -1,8 +1,8 @@
 """Wraps the private and undocumented parts of RLlib, Tune and torch, the only place that uses them.
 
 Each function or class names the internal or the upstream fault that it relies on, as of Ray 2.60 and torch 2.13.
-tests/training/test_rllib_compat.py fails where an internal has changed, tests/training/test_rllib_faults.py where a
-fault has been fixed upstream.
+tests/upgrade/test_rllib.py fails where an internal has changed, tests/upgrade/test_rllib_faults.py where a fault has
+been fixed upstream.
 """
 
 import logging

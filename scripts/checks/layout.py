@@ -14,6 +14,21 @@ MAX_LINES, MAX_DEPENDENCIES = 3_000, 17
 """Budget of a package, without its sub-packages: lines, and other packages of the product that it imports."""
 ONE_PER_RESOURCE = {"serve_app/routes": 4_000}
 """Lines of packages with a module per resource of the HTTP API, which describes it, too."""
+RLLIB_COMPAT = Path("training/rllib_compat.py")
+DOCUMENTED = {
+    *("ray", "ray.tune", "ray.tune.registry", "ray.tune.schedulers", "ray.tune.experiment", "ray.job_submission"),
+    *("ray.tune.search", "ray.tune.search.optuna"),
+    *("ray.exceptions", "ray.rllib.core", "ray.rllib.core.columns", "ray.rllib.core.learner.learner"),
+    *("ray.rllib.algorithms", "ray.rllib.algorithms.algorithm", "ray.rllib.algorithms.algorithm_config"),
+    *("ray.rllib.core.rl_module.rl_module", "ray.rllib.core.rl_module.multi_rl_module"),
+    *("ray.rllib.core.rl_module.torch", "ray.rllib.core.rl_module.apis.value_function_api"),
+    *("ray.rllib.env.env_runner", "ray.rllib.env.multi_agent_env", "ray.rllib.env.single_agent_episode"),
+    *("ray.rllib.utils.metrics", "ray.rllib.utils.metrics.metrics_logger", "ray.rllib.utils.checkpoints"),
+    "ray.util.scheduling_strategies",
+}
+"""Modules of Ray's API reference and of its documented examples."""
+OVERRIDES = {"_forward", "_forward_exploration", "_forward_inference", "_forward_train"}
+"""Methods that the documentation of RLModule tells subclasses to override."""
 
 
 @cache
@@ -69,6 +84,33 @@ def check_upstream_internals() -> Iterator[str]:
         internals += ["__serve_"] * ("__serve_" in (ROOT / path).read_text())
         if internals and not path.as_posix().startswith(places):
             yield f"{path}: {internals[0]} may be used in {', '.join(places)} only"
+
+
+def check_internals_of_rllib() -> Iterator[str]:
+    """In training, only rllib_compat.py uses undocumented modules and private attributes of Ray."""
+    trees = {path: tree for path, tree in modules().items() if path.parts[0] == "training" and path != RLLIB_COMPAT}
+    names = OVERRIDES.union(*map(defined_names, trees.values()))
+    for path, tree in trees.items():
+        for node in ast.walk(tree):
+            match node:
+                case ast.ImportFrom(module=str(name)) if name.partition(".")[0] == "ray" and name not in DOCUMENTED:
+                    yield f"{path}:{node.lineno}: {name}: expected in {RLLIB_COMPAT} only"
+                case ast.Constant(value=str(text)) if text.startswith(("ray._", "ray.tune.")):
+                    yield f"{path}:{node.lineno}: {text!r}: expected in {RLLIB_COMPAT} only"
+                case ast.Attribute(attr=name) if name[0] == "_" and name[:2] != "__" and name not in names:
+                    yield f"{path}:{node.lineno}: {ast.unparse(node)}: expected in {RLLIB_COMPAT} only"
+
+
+def defined_names(tree: ast.Module) -> set[str]:
+    """Names that the functions, classes and assignments of a module define, including attributes of `self`."""
+    names = set()
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.Name(id=name, ctx=ast.Store()):
+                names.add(name)
+            case ast.Attribute(attr=name, ctx=ast.Store(), value=ast.Name(id="self")):
+                names.add(name)
+    return names
 
 
 def imports(tree: ast.Module) -> Iterator[str]:

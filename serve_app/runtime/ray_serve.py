@@ -1,6 +1,6 @@
 """Functions of Ray and Ray Serve that have no public API, and the logger of replicas.
 
-Ray is imported by the functions: its environment variables must be set first. tests/serve_app/runtime/test_upstream.py
+Ray is imported by the functions: its environment variables must be set first. tests/upgrade/test_serve.py
 checks that the upstream code is still as it is used here.
 """
 

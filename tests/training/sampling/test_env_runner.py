@@ -3,6 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from tests.support.environments.counting import Counting
 from tests.support.leagues.training_leagues import counting, tictactoe
 from training.algorithms.rllib_config import algorithm_config
 from training.learners.train_batch import train_batch
+from training.rllib_compat import EpisodeChunk
 from training.runs.trial import build_algorithm
 from training.sampling.env_runner import IDLE_SECONDS, SAMPLING_SECONDS, BatchedEnvRunner
 from training.sampling.episode_chunks import as_episodes
@@ -98,11 +100,20 @@ def test_openings_are_played_but_not_learned_from() -> None:
     assert sum(stat.peek() for stat in metrics[NUM_MODULE_STEPS_SAMPLED].values()) < 306
 
 
-def test_each_chunk_has_a_unique_id() -> None:
+def test_each_chunk_is_created_once_and_has_a_unique_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    """RLlib's runner converts all finished episodes again at each step."""
     runner = runner_of(counting(LIVES, []))
+    created: list[EpisodeChunk] = []
+    construct = EpisodeChunk.__init__
+
+    def recorded(self: EpisodeChunk, *arguments: Any, **options: Any) -> None:
+        created.append(self)
+        construct(self, *arguments, **options)
+
+    monkeypatch.setattr(EpisodeChunk, "__init__", recorded)
     chunks = [chunk for _ in range(30) for chunk in runner.sample(num_timesteps=5)]
     for ids in ([chunk.id_ for chunk in chunks], [chunk.multi_agent_episode_id for chunk in chunks]):
-        assert len(set(ids)) == len(chunks)
+        assert len(set(ids)) == len(chunks) == len(created)
 
 
 def test_log_probabilities_belong_to_the_actions_and_observations() -> None:
@@ -203,6 +214,19 @@ def test_newer_weights_are_applied() -> None:
     runner.set_state({COMPONENT_RL_MODULE: old, WEIGHTS_SEQ_NO: 0})
     assert value() != newer
     assert runner.get_state()[WEIGHTS_SEQ_NO] == 3
+
+
+def test_weights_of_a_module_that_is_added_later_are_applied() -> None:
+    """With the WEIGHTS_SEQ_NO of the weights that the runner already has, by which RLlib ignores them (ray#61960)."""
+    runner = runner_of(tictactoe())
+    spec = runner.config.get_multi_rl_module_spec(spaces=runner.get_spaces()).rl_module_specs["shared"]
+    weights = runner.get_state(COMPONENT_RL_MODULE)[COMPONENT_RL_MODULE]
+    runner.set_state({COMPONENT_RL_MODULE: weights, WEIGHTS_SEQ_NO: 3})
+    runner.module.add_module("snapshot", spec.build())
+    snapshot = spec.build().get_state()
+    runner.set_state({COMPONENT_RL_MODULE: {**weights, "snapshot": snapshot}, WEIGHTS_SEQ_NO: 3})
+    name = "policy_head.weight"
+    np.testing.assert_array_equal(runner.module["snapshot"].get_state()[name], snapshot[name])
 
 
 @pytest.mark.parametrize("truncated", CASES, ids=str)

@@ -8,11 +8,9 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.env.multi_agent_env import MultiAgentEnv
-from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_LEN_MEAN, NUM_ENV_STEPS_SAMPLED
 
 from league.config.league import LeagueConfig
-from league.environments.building import interface
 from league.errors import EnvironmentMismatch, IllegalAction
 from tests.support.leagues.training_leagues import COUNTING
 from training.modules.actor_critic import ActorCritic
@@ -199,19 +197,3 @@ def test_a_plain_rllib_script_trains_on_connect_four_with_a_masked_module() -> N
     finally:
         algorithm.stop()
     assert 7 <= result[ENV_RUNNER_RESULTS][EPISODE_LEN_MEAN] <= 42
-
-
-@pytest.mark.usefixtures("ray_session")
-@pytest.mark.parametrize(("truncated", "expected"), [([0, 1], (False, True)), ([], (True, False))])
-def test_rllibs_runner_distinguishes_truncation_from_termination(
-    truncated: list[int], expected: tuple[bool, bool]
-) -> None:
-    config = league(MEETING, name="plain_meeting", leaves=[3, 3], truncated=truncated)
-    register(config)
-    assert interface(config).policy_ids == ("agent_0", "agent_1")
-    rllib = PPOConfig().environment("plain_meeting").env_runners(num_env_runners=0)
-    rllib.multi_agent(policies={"agent_0", "agent_1"}, policy_mapping_fn=lambda agent, *_, **__: agent)
-    runner = MultiAgentEnvRunner(config=rllib, worker_index=0)
-    for episode in runner.sample(num_episodes=2):
-        for agent in episode.agent_episodes.values():
-            assert (agent.is_terminated, agent.is_truncated) == expected

@@ -18,6 +18,8 @@ from league.environments.conformance.examination import examine
 PAGE = Path(__file__).parents[2] / "docs" / "rllib-environments.md"
 ROW = re.compile(r"^\| `([\w.]+:\w+)` \| (?:`(\{.*\})`)? \| (accepted|refused: (.+)) \|$", re.MULTILINE)
 
+pytestmark = pytest.mark.slow
+
 
 def listed() -> dict[str, tuple[dict, str | None]]:
     """Environment → its arguments, and the reason why it is refused, in the table of the page."""
@@ -47,13 +49,7 @@ def test_the_page_lists_all_of_them() -> None:
     assert set(listed()) == shipped()
 
 
-LONG = ("multi_agent.pettingzoo_chess:MultiAgentChess", "multi_agent:MultiAgentMountainCar")
-"""Their episodes take seconds."""
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in listed()]
-)
+@pytest.mark.parametrize("name", listed())
 def test_each_is_accepted_or_refused_as_listed(name: str) -> None:
     arguments, reason = listed()[name]
     environment = {"entry_point": f"{examples.__name__}.{name}", "kwargs": arguments}

@@ -54,6 +54,8 @@ for pipe in alive.*; do [ ! -p "$pipe" ] || : > "$pipe"; done
 FRAGMENT = bytes((0x01, 0x82, 0, 0, 0, 0)) + b"ab"
 """The first frame of a fragmented text message, masked with zeros (RFC 6455, section 5.2)."""
 
+pytestmark = pytest.mark.slow
+
 
 class TestHAProxyConfiguration:
     """The lines of Ray's template that serve_app.runtime.haproxy_script edits."""
@@ -456,7 +458,6 @@ def _listening(process: psutil.Process) -> set[Any]:
     return {each.laddr for each in found if each.status == psutil.CONN_LISTEN}
 
 
-@pytest.mark.slow
 @pytest.mark.e2e
 class TestServer:
     """A real server, with Ray Serve and HAProxy."""
