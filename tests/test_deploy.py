@@ -60,15 +60,14 @@ def test_the_cluster_serves_like_a_single_machine() -> None:
     assert expected == SERVED
 
 
-@pytest.mark.parametrize("document", [DEPLOY, SERVED], ids=["deploy.yaml", "kuberay.yaml"])
-def test_both_files_are_valid_for_ray_and_our_settings(document: Any) -> None:
+def test_both_files_are_valid_for_ray_and_our_settings() -> None:
     from ray.serve.schema import ServeDeploySchema
 
-    ServeDeploySchema.model_validate(document)
-    settings = ServeSettings.model_validate(document["applications"][0]["args"])
-    deployment = document["applications"][0]["deployments"][0]
-    assert deployment["graceful_shutdown_timeout_s"] >= 40
-    assert settings.timeout < int(exports()["RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S"])
+    for document in (DEPLOY, SERVED):
+        ServeDeploySchema.model_validate(document)
+        settings = ServeSettings.model_validate(document["applications"][0]["args"])
+        assert document["applications"][0]["deployments"][0]["graceful_shutdown_timeout_s"] >= 40
+        assert settings.timeout < int(exports()["RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S"])
 
 
 @pytest.mark.parametrize("template", [HEAD, WORKERS["template"]], ids=["head", "workers"])
@@ -137,12 +136,8 @@ def faults(document: Any) -> list[str]:
     return [f"{error.json_path}: {error.message}" for error in found]
 
 
-@pytest.mark.parametrize("document", [*OBJECTS, ELASTIC], ids=lambda each: f"{each['kind']} {each['metadata']['name']}")
-def test_kubernetes_accepts_the_objects(document: Any) -> None:
-    assert faults(document) == []
-
-
-def test_an_unknown_field_is_a_fault() -> None:
+def test_kubernetes_accepts_the_objects_and_no_unknown_field() -> None:
+    assert [fault for document in (*OBJECTS, ELASTIC) for fault in faults(document)] == []
     service, job = (json.loads(json.dumps(document)) for document in (OBJECTS[0], OBJECTS[-1]))
     service["spec"]["rayClusterConfig"]["headGroupSpec"]["template"]["spec"]["containers"][0]["volumes"] = []
     job["spec"]["jobTemplate"]["spec"]["template"]["spec"]["securityContext"]["runAs"] = 1000
@@ -158,14 +153,10 @@ POD_SPECS = [
 ]
 
 
-@pytest.mark.parametrize(
-    "spec", POD_SPECS, ids=["head", "workers", "nightly", "training night", "elastic head", "elastic workers"]
-)
-def test_pods_run_as_the_user_of_the_image(spec: Any) -> None:
-    (uid, gid) = re.findall(r"^USER (\d+):(\d+)$", (ROOT / "Dockerfile").read_text(), flags=re.M)[0]
-    context = spec["securityContext"]
-    assert context["runAsNonRoot"]
-    assert [context[key] for key in ("runAsUser", "runAsGroup", "fsGroup")] == [int(uid), int(gid), int(gid)]
+def test_pods_run_as_the_user_of_the_image() -> None:
+    ((uid, gid),) = re.findall(r"^USER (\d+):(\d+)$", (ROOT / "Dockerfile").read_text(), flags=re.M)
+    user = {"runAsNonRoot": True, "runAsUser": int(uid), "runAsGroup": int(gid), "fsGroup": int(gid)}
+    assert [spec["securityContext"] | user for spec in POD_SPECS] == [spec["securityContext"] for spec in POD_SPECS]
 
 
 HAPROXY = "league-haproxy"
@@ -254,19 +245,16 @@ def samples() -> dict[str, tuple[str, ...]]:
     return found
 
 
-@pytest.mark.parametrize(("where", "query"), queries())
-def test_each_query_uses_existing_metrics_and_labels(where: str, query: str) -> None:
-    known = samples()
-    used = re.findall(r"\b(league_\w+)", query)
-    assert used or "up{" in query
-    assert set(used) <= known.keys(), where
-    for name, selector in re.findall(r"\b(league_\w+)\{([^}]*)\}", query):
-        assert set(re.findall(r"(\w+)\s*=~?\"", selector)) <= set(known[name]), where
-    grouped = chain.from_iterable(re.split(r",\s*", labels) for labels in re.findall(r"by \(([^)]*)\)", query))
-    assert set(grouped) <= set(chain.from_iterable(known[name] for name in used)), where
-
-
-def test_each_metric_is_on_the_dashboard_or_in_an_alert() -> None:
+def test_queries_use_existing_metrics_and_labels_and_each_metric_is_used() -> None:
+    labels_of = samples()
+    for place, query in queries():
+        metrics = re.findall(r"\b(league_\w+)", query)
+        assert metrics or "up{" in query, place
+        assert set(metrics) <= labels_of.keys(), place
+        for name, selector in re.findall(r"\b(league_\w+)\{([^}]*)\}", query):
+            assert set(re.findall(r"(\w+)\s*=~?\"", selector)) <= set(labels_of[name]), place
+        grouped = chain.from_iterable(re.split(r",\s*", labels) for labels in re.findall(r"by \(([^)]*)\)", query))
+        assert set(grouped) <= set(chain.from_iterable(labels_of[name] for name in metrics)), place
     expressions = " ".join(query for _, query in queries())
     assert {name for name in METRICS if name not in expressions} == set()
 
@@ -289,11 +277,8 @@ def test_each_alert_is_documented() -> None:
     assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in RULES)
 
 
-def test_each_metric_is_documented() -> None:
+def test_each_metric_and_serving_setting_is_documented() -> None:
     assert set(re.findall(r"^\| `(league_\w+)` \|", MONITORING, flags=re.M)) == METRICS.keys()
-
-
-def test_each_serving_setting_is_documented_with_its_default() -> None:
     rows = dict(re.findall(r"^\| `(\w+)` \| `(.*?)` \|", SETTINGS, flags=re.M))
     defaults = {name: field.default for name, field in ServeSettings.model_fields.items()}
     assert {name: yaml.safe_load(value) for name, value in rows.items()} == defaults
@@ -361,16 +346,16 @@ def size(quantity: str) -> int:
     return int(quantity[:-2]) * MEMORY[quantity[-2:]]
 
 
-@pytest.mark.parametrize("pod", POD_SPECS[2:], ids=["nightly", "training night", "elastic head", "elastic workers"])
-def test_shared_memory_holds_the_object_store_of_ray(pod: Any) -> None:
+def test_shared_memory_holds_the_object_store_of_ray() -> None:
     """Otherwise Ray uses the container's disk."""
     from ray._private.ray_constants import DEFAULT_OBJECT_STORE_MEMORY_PROPORTION
 
-    (container,) = pod["containers"]
-    (volume,) = [volume["emptyDir"] for volume in pod["volumes"] if volume["name"] == "shared-memory"]
-    limit = size(container["resources"]["limits"]["memory"])
-    assert volume["medium"] == "Memory"
-    assert DEFAULT_OBJECT_STORE_MEMORY_PROPORTION * limit < size(volume["sizeLimit"]) < limit
+    for pod in POD_SPECS[2:]:
+        (container,) = pod["containers"]
+        (volume,) = [volume["emptyDir"] for volume in pod["volumes"] if volume["name"] == "shared-memory"]
+        limit = size(container["resources"]["limits"]["memory"])
+        assert volume["medium"] == "Memory"
+        assert DEFAULT_OBJECT_STORE_MEMORY_PROPORTION * limit < size(volume["sizeLimit"]) < limit
 
 
 def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
@@ -429,11 +414,11 @@ def test_serving_and_evaluation_import_no_dependency_of_training() -> None:
     assert set(process.stdout.split()) & (TRAINING | {"training"}) == set()
 
 
-@pytest.mark.parametrize("file", ["deploy.yaml", "deploy/kuberay.yaml", "deploy/kuberay-training.yaml", "Dockerfile"])
-def test_libraries_report_their_use_nowhere(file: str) -> None:
-    text = (ROOT / file).read_text()
-    for name in ("ORT_DISABLE_TELEMETRY", "RAY_USAGE_STATS_ENABLED"):
-        assert re.search(rf'{name}(=|, value: ")({REPORTS_OFF[name]})\b', text)
+def test_libraries_report_their_use_nowhere() -> None:
+    for file in ("deploy.yaml", "deploy/kuberay.yaml", "deploy/kuberay-training.yaml", "Dockerfile"):
+        text = (ROOT / file).read_text()
+        for name in ("ORT_DISABLE_TELEMETRY", "RAY_USAGE_STATS_ENABLED"):
+            assert re.search(rf'{name}(=|, value: ")({REPORTS_OFF[name]})\b', text), file
 
 
 def test_the_container_images_have_the_deployed_tags() -> None:
@@ -457,19 +442,16 @@ def locked(*names: str) -> dict[str, tuple[str, list[str]]]:
     return pins
 
 
-@pytest.mark.parametrize("torch", ["-cpu", "-cuda"])
-def test_the_lock_files_have_digests_of_all_pins(torch: str) -> None:
-    found = locked("-build", "", torch)
+def test_the_lock_files_have_digests_of_all_pins_which_build_with_the_pinned_setuptools() -> None:
     pinned = (line.partition("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if line[0] != "#")
     pins = {canonicalize_name(package): version for package, _, version in pinned}
-    assert {package: found[package][0].partition("+")[0] for package in pins} == pins
-    assert all(package.startswith(("nvidia-", "cuda-", "triton")) for package in found.keys() - pins.keys())
-    for version, hashes in found.values():
-        assert version
-        assert hashes
-        assert all(re.fullmatch("--hash=sha256:[0-9a-f]{64}", each) for each in hashes)
-
-
-def test_packages_are_built_with_the_pinned_setuptools() -> None:
+    for torch in ("-cpu", "-cuda"):
+        packages = locked("-build", "", torch)
+        assert {package: packages[package][0].partition("+")[0] for package in pins} == pins
+        assert all(package.startswith(("nvidia-", "cuda-", "triton")) for package in packages.keys() - pins.keys())
+        for version, hashes in packages.values():
+            assert version
+            assert hashes
+            assert all(re.fullmatch("--hash=sha256:[0-9a-f]{64}", digest) for digest in hashes)
     required = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
     assert required == [f"setuptools=={locked('-build')['setuptools'][0]}"]
