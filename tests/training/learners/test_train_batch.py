@@ -1,20 +1,30 @@
 """The bootstrap of each way in which a chunk can end, with known values; and recurrent states."""
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 
 from training.learners import train_batch as train_batches
-from training.learners.train_batch import TrainBatch, generalized_advantages, train_batch
+from training.learners.train_batch import (
+    Minibatch,
+    Sequences,
+    TrainBatch,
+    generalized_advantages,
+    minibatches,
+    train_batch,
+)
 from training.modules.actor_critic import ActorCritic
 from training.sampling.episode_chunks import EpisodeChunks
 
-GAMMA, LAMBDA = 0.5, 0.9
+GAMMA, LAMBDA = 0.9, 0.8
 
 
 def network(space: spaces.Space, **config: Any) -> ActorCritic:
@@ -171,3 +181,133 @@ def test_steps_without_recurrence_are_taken_in_any_order(identity: Identity) -> 
     assert minibatch.inputs[Columns.OBS]["observation"].tolist() == [[16.0], [2.0]]
     assert minibatch.targets.tolist() == found.targets[[2, 0]].tolist()
     assert set(minibatch.inputs) == {Columns.OBS}
+
+
+def by_definition(rewards: list[float], values: list[float], bootstrap: float) -> list[float]:
+    """A_t = Σ_k (γλ)^k δ_{t+k} over one chunk (equation 11 of the paper), as a sum per step."""
+    following = [*values[1:], bootstrap]
+    deltas = [r + GAMMA * n - v for r, v, n in zip(rewards, values, following, strict=True)]
+    return [sum((GAMMA * LAMBDA) ** k * delta for k, delta in enumerate(deltas[t:])) for t in range(len(deltas))]
+
+
+def by_recursion(rewards: NDArray, values: NDArray, next_values: NDArray, lasts: NDArray, decay: float) -> list[float]:
+    """A_t = δ_t + γλ A_{t+1} (equation 16), step by step."""
+    advantages = []
+    following = 0.0
+    for reward, value, next_value, last in zip(
+        *(column[::-1].tolist() for column in (rewards, values, next_values, lasts)), strict=True
+    ):
+        following = reward + GAMMA * next_value - value + (0.0 if last else decay * following)
+        advantages.append(following)
+    return advantages[::-1]
+
+
+numbers = st.floats(-10, 10, width=32)
+chunks = st.lists(
+    st.tuples(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=6), numbers), min_size=1, max_size=5
+)
+
+
+@given(chunks)
+@settings(deadline=None)
+def test_advantages_equal_the_definition_for_consecutive_chunks(
+    chunks: list[tuple[list[tuple[float, float]], float]],
+) -> None:
+    expected, rewards, values, next_values, lasts = [], [], [], [], []
+    for steps, bootstrap in chunks:
+        rewarded, valued = [r for r, _ in steps], [v for _, v in steps]
+        expected += by_definition(rewarded, valued, bootstrap)
+        rewards += rewarded
+        values += valued
+        next_values += [*valued[1:], bootstrap]
+        lasts += [False] * (len(steps) - 1) + [True]
+    found = generalized_advantages(
+        np.array(rewards), np.array(values), np.array(next_values), np.array(lasts), GAMMA, LAMBDA
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@given(st.lists(st.integers(1, 300), min_size=1, max_size=6), st.sampled_from([0.0, LAMBDA, 1.0]), st.integers(0, 9))
+@settings(deadline=None)
+def test_advantages_of_chunks_of_any_lengths_equal_the_recursion(lengths: list[int], lambda_: float, seed: int) -> None:
+    rewards, values, next_values = np.random.default_rng(seed).normal(size=(3, sum(lengths)))
+    lasts = np.isin(np.arange(sum(lengths)), np.cumsum(lengths) - 1)
+    advantages = generalized_advantages(rewards, values, next_values, lasts, GAMMA, lambda_)
+    expected = by_recursion(rewards, values, next_values, lasts, GAMMA * lambda_)
+    np.testing.assert_allclose(advantages, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_golden_numbers() -> None:
+    """Two steps, then truncated with value 2; by hand: δ = (1 + .9·1 − 0, 0 + .9·2 − 1) = (1.9, .8)."""
+    found = generalized_advantages(
+        np.array([1.0, 0.0]), np.array([0.0, 1.0]), np.array([1.0, 2.0]), np.array([False, True]), GAMMA, LAMBDA
+    )
+    np.testing.assert_allclose(found, [1.9 + 0.72 * 0.8, 0.8])
+
+
+def batch(steps: int, sequence: int | None = None) -> TrainBatch:
+    """Each column is the number of the step."""
+    number = torch.arange(steps)
+    sequences = None
+    if sequence is not None:
+        starts = torch.arange(0, steps, sequence)
+        lengths = torch.clamp(steps - starts, max=sequence)
+        sequences = Sequences(starts, lengths, {"h": starts[:, None].float()})
+    return TrainBatch({"observation": number * 10}, number, number, number, number, number, number, sequences, 0.0)
+
+
+def numbers_of(steps: Minibatch) -> list[int]:
+    assert torch.equal(steps.inputs[Columns.OBS]["observation"], steps.actions * 10)
+    return steps.actions.tolist()
+
+
+@given(
+    st.dictionaries(st.sampled_from("abc"), st.integers(1, 60), min_size=1),
+    st.integers(1, 20),
+    st.integers(1, 3),
+    st.none() | st.integers(1, 7),
+)
+@settings(max_examples=60, deadline=None)
+def test_each_step_of_each_policy_occurs_once_per_epoch(
+    sizes: dict[str, int], size: int, epochs: int, sequence: int | None
+) -> None:
+    seen: dict[str, Counter[int]] = {policy: Counter() for policy in sizes}
+    batches = {policy: batch(steps, sequence) for policy, steps in sizes.items()}
+    for minibatch in minibatches(batches, size=size, epochs=epochs):
+        for policy, steps in minibatch.items():
+            taken = numbers_of(steps)
+            assert 1 <= len(taken) <= size + (sequence or 1) * -(-size // (sequence or 1))
+            seen[policy].update(taken)
+    for policy, steps in sizes.items():
+        assert seen[policy] == Counter(dict.fromkeys(range(steps), epochs))
+
+
+def test_a_small_policy_is_trained_for_the_same_epochs() -> None:
+    found = list(minibatches({"large": batch(4000), "small": batch(100)}, size=400, epochs=10))
+    assert len(found) == 100
+    assert all(len(minibatch["small"].actions) == 10 for minibatch in found)
+    assert all(len(minibatch["large"].actions) == 400 for minibatch in found)
+
+
+def test_the_order_differs_between_epochs_and_depends_on_the_seed() -> None:
+    orders = []
+    for _ in range(2):
+        torch.manual_seed(3)
+        orders.append([numbers_of(minibatch["a"]) for minibatch in minibatches({"a": batch(50)}, size=50, epochs=2)])
+    first, second = orders[0]
+    assert first != second
+    assert orders[0] == orders[1]
+
+
+def test_sequences_are_kept_whole_and_shuffled() -> None:
+    torch.manual_seed(3)
+    starts = []
+    for minibatch in minibatches({"a": batch(60, sequence=5)}, size=20, epochs=1):
+        steps = minibatch["a"]
+        firsts = steps.inputs[Columns.STATE_IN]["h"][:, 0].long().tolist()
+        lengths = steps.inputs[Columns.SEQ_LENS].tolist()
+        assert len(steps.actions) == 20
+        expected = [first + i for first, length in zip(firsts, lengths, strict=True) for i in range(length)]
+        assert numbers_of(steps) == expected
+        starts += firsts
+    assert sorted(starts) == list(range(0, 60, 5)) != starts

@@ -6,15 +6,23 @@ import torch
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from ray.rllib.core.columns import Columns
+from torch import Tensor, distributions
 
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
+from league.policies.actions import dist_inputs_size
+from league.spaces.conversion import from_gymnasium
 from tests.support.leagues.training_leagues import solvable
 from training.algorithms.rllib_config import module_spec
 from training.modules.actor_critic import ActorCritic, SharedEncoder
+from training.modules.distributions import torch_distribution
 from training.modules.policy_module import MASKED_LOGIT
+from training.modules.recurrent import GRULayer
+from training.modules.value_function import ReturnNormalization
+from training.sampling.distributions import distribution as sampled_from
 
 PLANES = spaces.Box(0, 1, (6, 7, 2), np.int8)
 MASK = spaces.Box(0, 1, (7,), np.int8)
@@ -220,3 +228,88 @@ def test_statistics_cover_all_policies() -> None:
     net = build(solvable("far_numbers", normalize_observations=True, shared_encoder=True))
     net["shared"].encoder.update_statistics({"observation": torch.from_numpy(np.array([[1.0], [3.0]]))})
     assert net.encoder.features.parts[0][0].mean.tolist() == pytest.approx([2.0])
+
+
+RETURNS = arrays(np.float64, st.integers(2, 20), elements=st.floats(-1e4, 1e4))
+
+
+@given(st.lists(RETURNS, min_size=1, max_size=3))
+def test_units_are_the_mean_and_deviation_of_all_returns(batches: list[np.ndarray]) -> None:
+    scale = ReturnNormalization()
+    for batch in batches:
+        scale.update(torch.from_numpy(batch))
+    together = np.concatenate(batches)
+    np.testing.assert_allclose(scale.denormalized(np.zeros(1)), together.mean(), atol=1e-6)
+    np.testing.assert_allclose(scale.deviation, np.sqrt(together.var() + 1e-8), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(scale.denormalized(scale.normalized(together)), together, atol=1e-6)
+
+
+def test_before_the_first_returns_units_are_those_of_returns() -> None:
+    assert ReturnNormalization().denormalized(np.array([3.0])) == pytest.approx(3.0)
+
+
+def test_rare_returns_are_not_clipped() -> None:
+    scale = ReturnNormalization()
+    scale.update(torch.tensor([0.0] * 999 + [1000.0]))
+    assert scale.normalized(np.array([1000.0]))[0] == pytest.approx(31.6, abs=0.1)
+
+
+def test_the_layer_equals_torchs_gru_cell() -> None:
+    torch.manual_seed(0)
+    own, theirs = GRULayer(5, 4), torch.nn.GRUCell(5, 4)
+    with torch.no_grad():
+        own.from_input.bias.normal_()
+        own.from_hidden.bias.normal_()
+        theirs.weight_ih.copy_(own.from_input.weight)
+        theirs.weight_hh.copy_(own.from_hidden.weight)
+        theirs.bias_ih.copy_(own.from_input.bias)
+        theirs.bias_hh.copy_(own.from_hidden.bias)
+    inputs, hidden = torch.randn(7, 5), torch.randn(7, 4)
+    torch.testing.assert_close(own(inputs, hidden), theirs(inputs, hidden))
+
+
+DISCRETE, PAIR, BOX = spaces.Discrete(4, start=2), spaces.MultiDiscrete([[2], [3]]), spaces.Box(-1, 1, (2, 1))
+SPACES = pytest.mark.parametrize("space", [DISCRETE, PAIR, BOX], ids=["discrete", "multi", "box"])
+ROWS = 50
+
+
+def reference(space: spaces.Space, inputs: Tensor) -> list[distributions.Distribution]:
+    """torch's distributions, one for each element."""
+    if space is BOX:
+        return [distributions.Normal(inputs[:, i], inputs[:, 2 + i].exp()) for i in range(2)]
+    parts = [inputs] if space is DISCRETE else [inputs[:, :2], inputs[:, 2:]]
+    return [distributions.Categorical(logits=part) for part in parts]
+
+
+def dist_inputs(space: spaces.Space, seed: int) -> Tensor:
+    torch.manual_seed(seed)
+    return torch.randn(ROWS, dist_inputs_size(from_gymnasium(space)))
+
+
+@SPACES
+def test_evaluation_equals_torch(space: spaces.Space) -> None:
+    old, new = dist_inputs(space, 0), dist_inputs(space, 1)
+    ours, elements = torch_distribution(space), reference(space, old)
+    raw = torch.stack([element.sample() for element in elements], dim=-1)
+    log_p, entropy = ours.evaluate(old, raw[:, 0] if space is DISCRETE else raw)
+    expected = sum(element.log_prob(raw[:, i]) for i, element in enumerate(elements))
+    assert torch.allclose(log_p, expected, atol=1e-5)
+    assert torch.allclose(entropy, sum(element.entropy() for element in elements), atol=1e-5)
+    pairs = zip(elements, reference(space, new), strict=True)
+    assert torch.allclose(
+        ours.divergence(old, new), sum(distributions.kl_divergence(a, b) for a, b in pairs), atol=1e-4
+    )
+    torch.testing.assert_close(ours.divergence(old, old), torch.zeros(ROWS))
+    mode = torch.stack([element.mode for element in elements], dim=-1)
+    assert torch.equal(ours.mode(old), mode[:, 0] if space is DISCRETE else mode)
+
+
+@SPACES
+def test_evaluation_equals_the_distribution_of_runners(space: spaces.Space) -> None:
+    inputs = dist_inputs(space, 2)
+    runner = sampled_from(from_gymnasium(space))
+    raw, log_p = runner.sample(inputs.numpy(), np.random.default_rng(0))
+    ours_log_p, entropy = torch_distribution(space).evaluate(inputs, torch.from_numpy(raw))
+    np.testing.assert_allclose(ours_log_p, log_p, atol=1e-5)
+    np.testing.assert_allclose(entropy, runner.entropy(inputs.numpy()), atol=1e-5)
+    assert (torch_distribution(space).mode(inputs).numpy() == runner.mode(inputs.numpy())[0]).all()

@@ -10,7 +10,8 @@ from scipy.stats import chisquare, kstest
 from league.errors import ConfigError
 from league.spaces import Box, Discrete, MultiDiscrete, Space
 from training.modules.policy_module import MASKED_LOGIT
-from training.sampling.distributions import distribution
+from training.sampling import distributions
+from training.sampling.distributions import OrnsteinUhlenbeck, distribution
 
 ROWS = 20_000
 NVEC = [2, 3, 4]
@@ -101,3 +102,73 @@ def test_random_actions_are_uniform_over_legal_actions() -> None:
 def test_unsupported_spaces_are_rejected() -> None:
     with pytest.raises(ConfigError, match="expected Discrete, MultiDiscrete or a Box of floats"):
         distribution(Box(dtype="int32", shape=(2,), low=0, high=5))
+
+
+def test_log_softmax_of_masked_logits() -> None:
+    found = distributions.log_softmax(np.array([[0.0, np.log(3), -1e9]], np.float32))
+    np.testing.assert_allclose(np.exp(found), [[0.25, 0.75, 0.0]], atol=1e-6)
+    assert found.dtype == np.float32
+
+
+def test_samples_follow_the_distribution() -> None:
+    p = np.array([0.5, 0.3, 0.2, 0.0])
+    with np.errstate(divide="ignore"):
+        log_p = np.maximum(np.log(p), -1e9).astype(np.float32)
+    samples = distributions.sample(np.tile(log_p, (20_000, 1)), np.random.default_rng(1))
+    counts = np.bincount(samples, minlength=4)
+    assert counts[3] == 0
+    assert chisquare(counts[:3], 20_000 * p[:3]).pvalue > 1e-3
+
+
+def test_masked_actions_are_not_sampled_if_the_noise_is_zero() -> None:
+    class Zeros:
+        def standard_exponential(self, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+            return np.where(np.arange(shape[-1]) == 0, 0, np.ones(shape)).astype(dtype)
+
+    log_p = np.array([[-1e9, -0.7, -0.7]], np.float32)
+    assert distributions.sample(log_p, Zeros()) == [1]  # type: ignore[arg-type]
+
+
+def test_entropy_in_nats() -> None:
+    uniform = distributions.log_softmax(np.zeros((1, 4), np.float32))
+    certain = distributions.log_softmax(np.array([[0.0, -1e9]], np.float32))
+    np.testing.assert_allclose(distributions.entropy(uniform), [np.log(4)], rtol=1e-6)
+    assert distributions.entropy(certain).tolist() == pytest.approx([0.0])
+
+
+THETA, SIGMA = 0.15, 0.2
+
+
+def walk(steps: int, num_envs: int = 1) -> np.ndarray:
+    """(steps, environments) of one agent with one element, around a mean of 3."""
+    noise, rng = OrnsteinUhlenbeck(THETA, num_envs, 1, 1), np.random.default_rng(0)
+    inputs = np.tile(np.array([[3.0, np.log(SIGMA)]], np.float32), (num_envs, 1))
+    rows = range(num_envs)
+    return np.stack([noise.draw(list(rows), [0] * num_envs, inputs, rng)[:, 0] for _ in range(steps)])
+
+
+def test_the_noise_follows_its_equation() -> None:
+    rng = np.random.default_rng(0)
+    state, expected = 0.0, []
+    for _ in range(20):
+        state = (1 - THETA) * state + SIGMA * rng.standard_normal(dtype=np.float32)
+        expected.append(3 + state)
+    assert walk(20)[:, 0] == pytest.approx(np.array(expected), abs=1e-6)
+
+
+def test_the_noise_is_correlated_and_stationary() -> None:
+    late = walk(200, num_envs=4000)[100:] - 3
+    deviation = SIGMA / np.sqrt(1 - (1 - THETA) ** 2)
+    assert late.std() == pytest.approx(deviation, rel=0.02)
+    assert (late[1:] * late[:-1]).mean() / late.var() == pytest.approx(1 - THETA, abs=0.02)
+
+
+def test_each_agent_has_its_own_noise_until_its_episode_ends() -> None:
+    noise, rng = OrnsteinUhlenbeck(THETA, 2, 2, 1), np.random.default_rng(0)
+    noisy, quiet = np.array([[0.0, 2.0]], np.float32), np.array([[0.0, -50.0]], np.float32)
+    for env in (0, 1):
+        noise.draw([env], [1], noisy, rng)
+    assert noise.draw([0], [0], quiet, rng)[0, 0] == pytest.approx(0, abs=1e-6), "the other agent has its own noise"
+    noise.forget(0)
+    assert noise.draw([0], [1], quiet, rng)[0, 0] == pytest.approx(0, abs=1e-6)
+    assert abs(noise.draw([1], [1], quiet, rng)[0, 0]) > 0.01, "the noise of the other environment continues"

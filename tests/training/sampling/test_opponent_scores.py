@@ -1,13 +1,20 @@
+"""The memory of recurrent opponents."""
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from league.config.opponents import OpponentConfig
 from league.environments.stepping import Batch, Turn
 from league.environments.vector.vector_env import AgentRows
 from league.results.records import Scoring
 from league.results.scoring import scores
+from tests.support.leagues.registries import interface
+from tests.support.policies.bots import MODULE
 from training.sampling.opponent_scores import MOST_WAITING, OpponentResults, OpponentScores, OpposedGames
+from training.sampling.opponents import OpponentPolicy, Opponents
+from training.sampling.recurrent_state import RecurrentStates
 
 RETURNS = st.sampled_from([-1.0, 0.0, 0.25, 7.0])
 GAMES = st.lists(st.tuples(RETURNS, RETURNS), max_size=8)
@@ -120,3 +127,28 @@ def test_equal_policies_score_a_half(sides: int) -> None:
     collected.add_turn(Turn(endings=[rows(envs.tolist(), envs.tolist(), [1.0] * sides)], finished=envs))
     found = collected.take(1)
     assert (found.games.tolist(), found.scores.tolist()) == ([sides], [pytest.approx(sides / 2)])
+
+
+def test_opponents_forget_what_happened_in_earlier_episodes() -> None:
+    opponents = Opponents([], interface(), None, num_envs=3)
+    states = RecurrentStates({"h": np.zeros(2, np.float32)}, num_envs=3, agents=2)
+    opponents._recurrent_states[OpponentPolicy("board@1", "shared")] = states
+    envs = np.arange(3)
+    batch = Batch(envs, np.zeros(3, np.int64), {}, np.zeros(3))
+    states.update(batch, {"h": np.ones((3, 2), np.float32)})
+    opponents.forget(np.array([0, 2]))
+    np.testing.assert_array_equal(states.get(batch)["h"], [[0, 0], [1, 1], [0, 0]])
+
+
+def test_bots_have_one_instance_for_each_agent_and_episode() -> None:
+    ref = f"script:{MODULE}:Alternating"
+    opponents = Opponents([OpponentConfig(ref=ref, share=1.0)], interface(), None, num_envs=2)
+    observations = {"observation": np.zeros((2, 3, 3, 2), np.int8), "action_mask": np.ones((2, 9), np.int8)}
+    batch = Batch(np.arange(2), np.zeros(2, np.int64), observations, np.zeros(2))
+
+    def act() -> list[int]:
+        return opponents.act(OpponentPolicy(ref, "shared"), batch, np.random.default_rng(0)).tolist()
+
+    assert act() == [8, 8]
+    opponents.forget(np.array([0]))
+    assert act() == [8, 0]
