@@ -82,6 +82,12 @@ def solvable_by_dqn(
     )
 
 
+def qmix_league(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
+    """A training environment, with all agents in one team, and settings of QMIX that solve it in a few updates."""
+    settings = {"algorithm": "qmix", "groups": {"team": ["*"]}, "mixing_width": 8}
+    return solvable_by_dqn(name, kwargs, policies, **(settings | training))
+
+
 def maddpg(name: str, kwargs: dict[str, Any], policies: Any, **training: Any) -> LeagueConfig:
     """A training environment, with settings that solve it in some thousand actions."""
     settings = {

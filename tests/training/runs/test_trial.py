@@ -12,12 +12,11 @@ from league.config.environment import EnvironmentConfig
 from league.environments.building import interface
 from league.registry.registry import Registry
 from league.settings import Storage
-from tests.support.environments.counting import Counting
 from tests.support.leagues import registries
-from tests.support.leagues.training_leagues import counting, tictactoe
+from tests.support.leagues.training_leagues import tictactoe
 from tests.support.policies.graphs import masked_mlp
 from training.algorithms.metrics import OFF_POLICY_METRICS, metric_names
-from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, build_algorithm, read_progress
+from training.runs.trial import FROM_SCRATCH, StartState, Trial, TrialPlan, read_progress
 
 
 @pytest.fixture
@@ -27,41 +26,6 @@ def a_report_per_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 SCHEDULED = ("shared/lr", "shared/entropy_coefficient", "shared/clip")
-LEAGUE = counting([4, 6], [1], train_batch_size=120, minibatch_size=60, epochs=1, runners=0)
-
-
-@pytest.mark.usefixtures("ray_session")
-def test_training_continues_exactly_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weights, the moments of Adam and the step count are equal; no seed of an earlier reset is repeated."""
-    seeds: list[int] = []
-    reset = Counting.reset
-
-    def recording(self: Counting, seed: int | None = None, options: None = None) -> None:
-        seeds.append(seed)
-        reset(self, seed, options)
-
-    monkeypatch.setattr(Counting, "reset", recording)
-    first = build_algorithm(LEAGUE, interface(LEAGUE))
-    first.train()
-    first.train()
-    first.save_to_path(str(tmp_path / "240"))
-    learner = first.learner_group._learner
-    weights = {name: value.clone() for name, value in learner.module["policy_0"].state_dict().items()}
-    moments = learner.get_optimizer("policy_0").state_dict()["state"]
-    first.stop()
-    before = len(seeds)
-
-    second = build_algorithm(LEAGUE, interface(LEAGUE), tmp_path / "240")
-    restored = second.learner_group._learner
-    for name, value in restored.module["policy_0"].state_dict().items():
-        assert torch.equal(value, weights[name])
-    for index, state in restored.get_optimizer("policy_0").state_dict()["state"].items():
-        assert all(torch.equal(state[key], moments[index][key]) for key in ("step", "exp_avg", "exp_avg_sq"))
-    result = second.train()
-    second.stop()
-    assert result["num_env_steps_sampled_lifetime"] == 360
-    assert len(seeds) > before > 0
-    assert len(set(seeds)) == len(seeds)
 
 
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
