@@ -45,11 +45,11 @@ def pytest(seconds: float, *arguments: str) -> int:
 
 
 def first_lines(report: Path) -> dict[str, str]:
-    """Return the first line of each error, by the dotted name of the test."""
+    """Return the first line of the first error of each test, by its dotted name. Subtests fail before their test."""
     return {
         f"{case.get('classname')}.{case.get('name')}": problem.get("message", "").partition("\n")[0]
-        for case in ElementTree.parse(report).iter("testcase")
-        for problem in [*case.findall("error"), *case.findall("failure")]
+        for case in reversed(list(ElementTree.parse(report).iter("testcase")))
+        for problem in reversed([*case.findall("error"), *case.findall("failure")])
     }
 
 

@@ -38,7 +38,8 @@ def run(directory: Path, files: dict[str, str], *options: str, seconds: int = 30
 
 
 def test_a_test_that_passes_alone_is_flaky(tmp_path: Path) -> None:
-    files = {"test_a": "def test_it(): assert not is_first_time(), 'the first time'", "test_b": PASSING}
+    row = "    with subtests.test(row=1): assert not is_first_time(), 'the first time'"
+    files = {"test_a": f"def test_it(subtests):\n{row}", "test_b": PASSING}
     process = run(tmp_path, files)
     assert process.returncode == 0, process.stdout
     assert process.stdout.splitlines()[-2:] == ["FLAKY test_a.py::test_it", "    AssertionError: the first time"]
