@@ -213,5 +213,5 @@ def _first_failure(arguments: list[str], clone: Path) -> str | None:
         return arguments[0]
     if run.returncode in (0, 5):  # 5: no test was selected
         return None
-    failure = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", run.stdout, re.MULTILINE)
+    failure = re.search(r"^(?:FAILED|ERROR) (tests/.+?)(?: - .*)?$", run.stdout, re.MULTILINE)
     return failure[1] if failure else arguments[0]
