@@ -204,10 +204,10 @@ def test_a_buffer_that_is_not_saved_or_has_another_capacity_is_empty_after_resto
 @pytest.mark.parametrize(
     "league",
     [
-        pytest.param(dqn("masked"), id="dqn"),
+        pytest.param(dqn("masked"), marks=slow, id="dqn"),
         pytest.param(dqn("masked", **ALL_EXTENSIONS), id="dqn, all extensions"),
-        pytest.param(dqn("masked", **MEMORY), id="dqn, recurrent"),
-        pytest.param(qmix("masked"), id="qmix"),
+        pytest.param(dqn("masked", **MEMORY), marks=slow, id="dqn, recurrent"),
+        pytest.param(qmix("masked"), marks=slow, id="qmix"),
         pytest.param(qmix("masked", **MEMORY), id="qmix, recurrent"),
         pytest.param(maddpg("numbers", {}, {"shared": ["*"]}), id="maddpg, numbers"),
         pytest.param(maddpg("several", {"agents": 2}, {"shared": ["*"]}), marks=slow, id="maddpg, several"),

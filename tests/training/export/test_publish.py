@@ -62,7 +62,9 @@ def publish_checkpoint(registry: Registry, trained: Path, source: str = "run/64"
 
 def test_a_version_has_a_complete_manifest_and_acts_like_its_checkpoint(registry: Registry, trained: Path) -> None:
     first = publish_checkpoint(registry, trained)
+    assert publish_checkpoint(registry, trained) == first, "a checkpoint is published once"
     number = publish_checkpoint(registry, trained, source="run/65", parent=first)
+    assert len(registry.versions.all("tictactoe")) == 2
     manifest = registry.versions.get("tictactoe", number).manifest
     assert manifest.interface == interface(LEAGUE)
     assert manifest.environment == LEAGUE.environment
@@ -132,11 +134,6 @@ def test_a_recurrent_policy_is_exported_with_its_state(tmp_path: Path) -> None:
             before = found["state_out"]
     finally:
         registry.close()
-
-
-def test_a_checkpoint_is_published_once(registry: Registry, trained: Path) -> None:
-    assert publish_checkpoint(registry, trained) == publish_checkpoint(registry, trained)
-    assert len(registry.versions.all("tictactoe")) == 1
 
 
 def test_a_failed_parity_check_leaves_no_version(
