@@ -1,16 +1,39 @@
+"""The command as a whole: help, start-up, output, tables in a terminal of 80 columns, and `league doctor`."""
+
+import ast
+import json
 import os
 import re
+import socket
 import subprocess
 import sys
+from datetime import UTC, datetime, timedelta
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import typer
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.cells import cell_len
+from rich.console import Console
 
+from evaluation.documents import Progress
+from league.histograms import Histogram
+from league.refs import CheckpointRef
 from league.registry.registry import Registry
-from policy_league.cli import main
+from league.registry.storage.rows import ShadowCounts
+from league.registry.traffic import write_shadow_counts
+from policy_league import cli
+from policy_league.cli import doctor, main, output
+from policy_league.cli.demo import drawing
+from policy_league.cli.doctor import Check
 from policy_league.cli.main import SUBCOMMANDS, app
+from serve_app.runtime import launch
 from tests.support.command import League
+from tests.support.leagues import tictactoe
 
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -24,54 +47,17 @@ def test_the_commands_are_complete() -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_each_command_and_option_has_help(name: str) -> None:
-    command = COMMANDS[name]
-    assert command.help
-    assert len(command.help) > 40
-    for part in (command, *getattr(command, "commands", {}).values()):
-        assert part.help, f"{name} {part.name} has no help"
-        for parameter in part.params:
-            if parameter.name != "help":
-                assert getattr(parameter, "help", None), f"{name} {parameter.name} has no help"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "messages"),
-    [
-        (("versions", "chess"), ("no league 'chess'", "tictactoe")),
-        (("versions", "A/B"), ("'A/B' must consist of",)),
-        (("promote", "tictactoe@9", "--yes"), ("tictactoe", "9")),
-        (("promote", "tictactoe@champion", "--yes"), ("champion",)),
-        (("promote", "tictactoe"), ("contains no version",)),
-        (("promote", "tictactoe@1", "--yes", "--alias", "12"), ("version number",)),
-        (("promote", "tictactoe@1", "--yes", "--expected", "x"), ("--expected",)),
-        (("history", "tictactoe", "--at", "noon"), ("--at 'noon'",)),
-        (("train", "tictactoe", "--against", "@1"), ("--role exploiter", "--against")),
-        (("evaluate", "tictactoe", "connect_four@1"), ("connect_four@1",)),
-        (("evaluate", "tictactoe", "script:stockfish"), ("stockfish",)),
-        (("evaluate", "tictactoe", "--against", "tictactoe@1"), ("against", "gauntlet")),
-        (("evaluate", "tictactoe", "--minutes", "0"), ("minutes", "got 0")),
-        (("evaluate", "tictactoe", "--precision", "-5"), ("precision", "got -5")),
-        (("evaluate", "tictactoe", "--schedule", "cross_play"), ("cross-play", "2 side(s)")),
-        (("nightly", "nowhere.yaml"), ("nowhere.yaml: No such file",)),
-        (("train", "nowhere.yaml"), ("nowhere.yaml: No such file",)),
-        (("act", "script:random"), ("script",)),
-        (("act", "tictactoe@1", "--local", "-o", "[[["), ("not valid JSON",)),
-        (("act", "tictactoe@1", "--local", "-o", '{"observation": [[1]]}'), ("action_mask",)),
-        (("act", "tictactoe@1", "--local", "--policy", "other"), ("other",)),
-    ],
-)
-def test_a_usage_error_is_one_line_and_exits_with_2(
-    league: League, registry: Registry, arguments: tuple[str, ...], messages: tuple[str, ...]
-) -> None:
-    result = league(*arguments)
-    assert result.code == 2, result.err
-    assert result.out == ""
-    assert result.err.count("\n") == 1
-    assert result.err.startswith("league: ")
-    for word in messages:
-        assert word in result.err
+def test_each_command_and_option_has_help() -> None:
+    for name in sorted(COMMANDS):
+        command = COMMANDS[name]
+        assert len(command.help) > 40, name
+        for part in (command, *getattr(command, "commands", {}).values()):
+            assert part.help, f"{name} {part.name} has no help"
+            for parameter in part.params:
+                if parameter.name != "help":
+                    assert getattr(parameter, "help", None), f"{name} {parameter.name} has no help"
+    for name, listed in SUBCOMMANDS.items():
+        assert listed.help == COMMANDS[name].help.partition("\n\n")[0].replace("\n", " "), "its first paragraph"
 
 
 @pytest.mark.usefixtures("registry")
@@ -91,73 +77,46 @@ def test_an_unusable_home_is_reported_in_one_line(league: League, home: Path) ->
     assert "home" in result.err
 
 
-@pytest.mark.parametrize("folder", ["configs", "training", "evaluation", "league"])
-def test_a_folder_with_the_name_of_a_package_does_no_harm(
-    league_process: League, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
-) -> None:
-    (tmp_path / folder).mkdir()
+def test_folders_named_like_packages(league_process: League, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for folder in ("configs", "training", "evaluation", "league"):
+        (tmp_path / folder).mkdir()
     monkeypatch.chdir(tmp_path)
     result = league_process("train", "--help")
     assert (result.code, result.err) == (0, "")
 
 
-@pytest.mark.parametrize("name", sorted(SUBCOMMANDS))
-def test_the_listed_help_of_a_command_is_the_first_paragraph_of_its_help(name: str) -> None:
-    own = COMMANDS[name].help.partition("\n\n")[0]
-    assert SUBCOMMANDS[name].help == own.replace("\n", " ")
+LARGE_PACKAGES = "alembic gymnasium httpx league.config.league numpy onnxruntime pettingzoo ray scipy sqlalchemy torch"
 
 
-LARGE_PACKAGES = (
-    "alembic",
-    "gymnasium",
-    "httpx",
-    "league.config.league",
-    "numpy",
-    "onnxruntime",
-    "pettingzoo",
-    "ray",
-    "scipy",
-    "sqlalchemy",
-    "torch",
+IMPORTED = """
+import sys
+from typer.testing import CliRunner
+from policy_league.cli.main import SUBCOMMANDS, app
+for arguments in ARGUMENTS:
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+print(sorted(sys.modules.keys() & set(PACKAGES.split())))
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "allowed"),
+    [([["--help"], *([name, "--help"] for name in SUBCOMMANDS)], []), ([["versions", "tictactoe"]], ["sqlalchemy"])],
+    ids=["help", "versions of a league without games"],
 )
-
-
-def test_help_imports_no_large_package() -> None:
-    program = f"""if True:
-        import sys
-        from typer.testing import CliRunner
-        from policy_league.cli.main import SUBCOMMANDS, app
-        for arguments in ([], *([name] for name in SUBCOMMANDS)):
-            done = CliRunner().invoke(app, [*arguments, "--help"])
-            assert done.exit_code == 0, done.output
-        print(sorted(sys.modules.keys() & set({LARGE_PACKAGES})))
-    """
-    assert _last_line(program) == "[]"
-
-
-def test_the_versions_of_a_league_without_games_are_listed_without_numpy(home: Path, registry: Registry) -> None:
-    program = f"""if True:
-        import sys
-        from typer.testing import CliRunner
-        from policy_league.cli.main import app
-        done = CliRunner().invoke(app, ["versions", "tictactoe"])
-        assert done.exit_code == 0, done.output
-        print(sorted(sys.modules.keys() & ({set(LARGE_PACKAGES)} - {{"sqlalchemy"}})))
-    """
-    assert _last_line(program, LEAGUE_HOME=str(home)) == "[]"
-
-
-def _last_line(program: str, **environment: str) -> str:
-    """Run a program in a process of its own and return the last line that it prints."""
+def test_few_packages_are_imported(
+    home: Path, registry: Registry, arguments: list[list[str]], allowed: list[str]
+) -> None:
+    program = f"ARGUMENTS, PACKAGES = {arguments!r}, {LARGE_PACKAGES!r}\n{IMPORTED}"
     done = subprocess.run(
         [sys.executable, "-c", program],
-        env=os.environ | environment,
+        env=os.environ | {"LEAGUE_HOME": str(home)},
         capture_output=True,
         text=True,
         timeout=120,
         check=True,
     )
-    return done.stdout.splitlines()[-1]
+    assert done.stdout.splitlines()[-1] == str(allowed)
 
 
 def test_json_is_alone_on_stdout_although_the_environment_prints(league_process: League, tmp_path: Path) -> None:
@@ -177,3 +136,238 @@ def test_code_of_a_user_does_not_end_a_command_silently(
         main.run()
     assert end.value.code == 1
     assert re.fullmatch(rf"league: {re.escape(__file__)}, line \d+ called sys\.exit\(\)\n", capsys.readouterr().err)
+
+
+@pytest.fixture
+def printed(monkeypatch: pytest.MonkeyPatch) -> StringIO:
+    """What is printed outside a terminal, with a line for each event."""
+    text = StringIO()
+    monkeypatch.setattr(output, "console", Console(file=text))
+    monkeypatch.setattr(output, "SECONDS_PER_LINE", 0.0)
+    return text
+
+
+def test_outside_a_terminal_progress_is_printed_as_lines_unless_it_is_quiet(printed: StringIO) -> None:
+    with output.GameProgress(quiet=True) as listener:
+        listener(Progress("a against b", 8, 16))
+    with output.GameProgress(quiet=False) as listener:
+        listener(Progress("a against b", 0, 16))
+        listener(Progress("a against b", 8, 16, moves_per_second=123456.7, llr=1.2))
+        listener(Progress("a against b", 16, 16, nodes=1, cpus=2))
+    assert printed.getvalue().splitlines() == [
+        "a against b: 0/16 matches",
+        "a against b: 8/16 matches  123,457 moves/s  LLR +1.20",
+        "a against b: 16/16 matches  1 node, 2 CPUs",
+    ]
+
+
+UNTRUSTED = "safe\u202eevil\u2066\u200f\x1b[2J\x9b31m\u2028\r[bold]"
+"""Reverses the direction of text, clears a terminal, changes its colour, returns to the start of a line; has markup."""
+
+
+SHOWN = "safe�evil���[2J�31m��[bold]"
+
+
+def test_text_of_others_controls_neither_the_terminal_nor_the_direction_of_text(
+    printed: StringIO, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(output, "errors", output.console)
+    output.say(UNTRUSTED)
+    output.complain(UNTRUSTED)
+    output.table(("name",), [(UNTRUSTED,)])
+    with output.GameProgress(quiet=False) as listener:
+        monkeypatch.setattr(output, "SECONDS_PER_LINE", 0.0)
+        listener(Progress(UNTRUSTED, 1, 2))
+        listener(Progress(UNTRUSTED, 2, 2))
+    shown = printed.getvalue()
+    assert shown.count(SHOWN) >= 4
+    assert not output.CONTROL.search(shown)
+    output.emit({"name": UNTRUSTED})
+    written = capsys.readouterr().out
+    assert not output.CONTROL.search(written)
+    assert json.loads(written) == {"name": UNTRUSTED}
+
+
+def test_a_board_of_the_demo_is_drawn_with_its_columns() -> None:
+    planes = np.zeros((2, 3, 2), np.int8)
+    planes[1, 0, 0] = planes[1, 2, 1] = 1
+    assert drawing(planes) == "· · ·\n● · ○\n0 1 2"
+    assert drawing(np.zeros((6, 7), np.int8)) is drawing(np.full((2, 2, 2), 3)) is None
+
+
+@pytest.mark.slow
+def test_all_checks_of_doctor_pass(league_process: League) -> None:
+    result = league_process("doctor", "--json")
+    document = result.json
+    found = {check["what"]: check["status"] for check in document["checks"]}
+    assert {"Python", "ray", "torch", "CPU", "GPU", "LEAGUE_HOME", "disk", "registry", "Ray", "HAProxy"} <= set(found)
+    assert document["ok"], document
+    assert result.code == 0
+
+
+def test_doctor_explains_a_broken_home(league: League, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "CHECKS", (doctor._home, doctor._registry))
+    home.mkdir()
+    (home / "league.db").write_text("no database")
+    document = league("doctor", "--json").json
+    broken = [check for check in document["checks"] if check["status"] == "fail"]
+    assert [check["what"] for check in broken] == ["registry"]
+    assert "LEAGUE_HOME" in broken[0]["advice"]
+
+
+def test_a_missing_optional_package_is_a_note(league: League, monkeypatch: pytest.MonkeyPatch) -> None:
+    present = {name: version for name, version in doctor.VERIFIED.items() if name not in ("rlcard", "onnx")}
+    monkeypatch.setattr(doctor, "installed", lambda: present)
+    monkeypatch.setattr(doctor, "CHECKS", (doctor._stack,))
+    statuses = {check["what"]: check["status"] for check in league("doctor", "--json").json["checks"]}
+    assert statuses.pop("rlcard") == "note"
+    assert statuses.pop("onnx") == "fail"
+    assert set(statuses.values()) == {"ok"}
+
+
+def test_the_ports_are_those_of_the_deployment(league: League, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "CHECKS", (doctor._ports,))
+    monkeypatch.setattr(launch, "DEPLOY_YAML", deploy := tmp_path / "deploy.yaml")
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_server(("127.0.0.1", 0)) as other:
+        taken, free = (each.getsockname()[1] for each in (server, other))
+        other.close()
+        deploy.write_text(f"http_options: {{port: {free}}}\ngrpc_options: {{port: {taken}}}\n")
+        http, grpc = league("doctor", "--json").json["checks"]
+    assert (http["what"], http["status"], http["found"]) == ("serving HTTP", "ok", f"port {free} is free")
+    assert (grpc["what"], grpc["status"], grpc["found"]) == ("serving gRPC", "note", f"port {taken} is in use")
+    assert "--grpc-port PORT" in grpc["advice"]
+
+
+COLUMNS = 80
+
+
+NOTE = "learns from the search, then plays against itself and the two champions before it"
+
+
+TABLES = {
+    "versions/listing": ("versions", "tictactoe"),
+    "versions/aliases": ("history", "tictactoe"),
+    "serving/traffic": ("traffic", "tictactoe"),
+    "serving/replicas": ("replicas",),
+    "serving/keys": ("keys", "list"),
+    "versions/retire": ("retire", "--keep=1", "--days=0", "--dry-run"),
+    "doctor": ("doctor",),
+    "training/check_env": ("check-env", "simple_adversary", "--episodes=1"),
+    "evaluation/exploitability": ("exploitability", "tictactoe@1", "--blocks=2", "--workers=0"),
+    "evaluation/evaluate": ("evaluate", "tictactoe", "--blocks=2", "--workers=0"),
+    "leagues/listing": ("list",),
+    "leagues/comparison": ("compare", "20261124", "20261125"),
+    "training/runs": ("runs", "tictactoe"),
+    "evaluation/nightly": ("nightly", "tictactoe", "--workers=0"),
+}
+"""Module of `cli` → a command that prints its table."""
+
+
+@pytest.fixture
+def tables(monkeypatch: pytest.MonkeyPatch) -> StringIO:
+    """What is printed as tables in a terminal of 80 columns. Sentences are wrapped by the terminal."""
+    printed, block = StringIO(), output._print_block
+    monkeypatch.setattr(output.console, "width", COLUMNS)
+
+    def record(columns: Any) -> None:
+        with output.console.capture() as captured:
+            block(columns)
+        printed.write(captured.get())
+
+    monkeypatch.setattr(output, "_print_block", record)
+    return printed
+
+
+@pytest.fixture
+def used(registry: Registry) -> Registry:
+    """A league with notes, an exploiter, a promotion by a verdict, a shadow, replicas and keys."""
+    name = tictactoe.LEAGUE
+    tictactoe.publish(registry, tictactoe.graph(wins=True), exploits="tictactoe@1")
+    verdict = f"{name}-verdict-0f3a62d1c8b45e97-1b2c3d4e"
+    registry.verdicts.open(name, 2, "script:random", verdict, {"gate": {"alpha": 0.05}})
+    for number, of in ((1, None), (2, verdict)):
+        registry.aliases.set(
+            name, "champion", number, expected=of and 1, actor="league nightly", reason=NOTE, verdict=of
+        )
+        registry.versions.set_note(CheckpointRef(name, number), NOTE, actor="ada")
+    registry.verdicts.close(verdict, "promote", {"promoted": True})
+    for replica in ("policy-server-0/replica-1f0e2a7b", "policy-server-1/replica-77c01d2e"):
+        registry.replicas.register(replica, {})
+    counts = dict.fromkeys(("requests", "observations", "agreed"), 1_234_567)
+    shadow = ShadowCounts(
+        name, 3, 2, **counts, failed=12, dropped=1200, skipped=0, latency=tuple(Histogram().counts), ns=10**9
+    )
+    with registry.database.write() as session:
+        write_shadow_counts(session, "policy-server-0/replica-1f0e2a7b", [shadow])
+    for number, run in enumerate(("20261124-080000-aa12bc", "20261125-080000-de34f5")):
+        settings = {"policies_to_train": [NOTE, number], "gamma": 0.99}
+        registry.runs.begin(name, run, algorithm="ppo", settings=settings, seed=1, target=9000)
+        registry.runs.end(name, run, "ended")
+    until = datetime.now(UTC) + timedelta(days=90)
+    registry.keys.create("everything", ["act", "read", "evaluate", "promote"], expires_at=until, rate=100.0)
+    registry.keys.create("one-game", ["act"], only_leagues=[name])
+    return registry
+
+
+@pytest.mark.usefixtures("short_examinations")
+@pytest.mark.parametrize("module", TABLES)
+def test_tables_fit_80_columns(
+    league: League, request: pytest.FixtureRequest, tables: StringIO, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request.getfixturevalue("registry" if module == "evaluation/nightly" else "used")
+    advice = f"tested with 6.0: pip install 'policy-league[postgres]'. {NOTE}"
+    monkeypatch.setattr(
+        "policy_league.cli.doctor.CHECKS", (lambda: iter([Check("protobuf", "note", "5.29.3", advice)]),)
+    )
+    result = league(*TABLES[module])
+    assert result.code == 0, result.err
+    lines = tables.getvalue().splitlines()
+    assert lines
+    assert max(map(len, lines)) <= COLUMNS
+    cut = re.compile(r"tictactoe@|script:|0f3a62d?|policy-server-[01]|20\d\d-\d\d")
+    assert not [word for word in tables.getvalue().split() if cut.fullmatch(word)], "references are not wrapped"
+
+
+def test_the_commands_with_tables_are_complete() -> None:
+    folder = Path(cli.__file__).parent
+    printing = {
+        path.relative_to(folder).with_suffix("").as_posix()
+        for path in folder.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("table", "show_leaderboard")
+    }
+    # A sweep trains first; tests/cli/training/ prints its table.
+    assert printing - {"output", "training/sweep"} == set(TABLES)
+
+
+@pytest.mark.usefixtures("used")
+def test_a_verdict_is_shown_with_its_short_id(league: League, tables: StringIO) -> None:
+    assert league("history", tictactoe.LEAGUE).code == 0
+    assert tables.getvalue().splitlines()[1].endswith("  0f3a62d1")
+    assert "-verdict-" not in tables.getvalue()
+
+
+CELLS = st.one_of(
+    st.none(),
+    st.integers(-(10**12), 10**12),
+    st.floats(allow_nan=False, allow_infinity=False, width=16),
+    st.text("ab[]@:-é字", max_size=24),
+)
+
+
+@given(st.data(), st.integers(1, 9), st.integers(1, 4))
+def test_any_table_fits_and_only_prose_is_wrapped(data: st.DataObject, columns: int, rows: int) -> None:
+    names = [f"column {index}" for index in range(columns)]
+    cells = data.draw(st.lists(st.tuples(*[CELLS] * columns), min_size=rows, max_size=rows))
+    printed = Console(file=StringIO(), width=COLUMNS, highlight=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(output, "console", printed)
+        output.table([*names, "none", "note"], [(*row, None, NOTE) for row in cells], prose=["note"], optional=["none"])
+    lines = printed.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert max(map(cell_len, lines)) <= COLUMNS
+    assert not any("none" in line for line in lines)
+    for name, column in zip(names, zip(*cells, strict=True), strict=True):
+        assert any(name in line for line in lines)
+        for value in column:
+            assert any(output.text(value) in line for line in lines)
+    assert sum(line.count("search,") for line in lines) == rows

@@ -1,9 +1,12 @@
-"""The examples of docs/extending.md from training to matches, and a server that cannot import what trained."""
+"""The examples of docs/extending.md from training to matches, and code of others that a server does not have."""
 
 import io
+import os
 import re
 import subprocess
 import sys
+import sysconfig
+import venv
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,8 @@ import yaml
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import policy_league
+import policy_league_client
 from evaluation.matches.tournament import evaluate
 from league.config.league import LeagueConfig
 from league.environments.building import interface
@@ -26,9 +31,17 @@ from training.runs.train import check, train
 from training.runs.trial import build_algorithm
 
 PAGE = (Path(__file__).parents[2] / "docs/extending.md").read_text()
+
+
 LEAGUES = {league["league"]: league for league in map(yaml.safe_load, re.findall(r"```yaml\n(.*?)```", PAGE, re.S))}
+
+
 pytestmark = pytest.mark.slow
+
+
 SHORT = {"runners": 0, "num_envs": 4, "train_batch_size": 64, "minibatch_size": 32, "epochs": 1}
+
+
 SHORT_OFF_POLICY = {"runners": 0, "num_envs": 4, "learning_starts": 64, "batch_size": 32}
 
 
@@ -126,33 +139,116 @@ def test_a_callback_adds_metrics_and_its_fault_ends_a_run_that_can_be_resumed(
     assert {"callbacks/length", "callbacks/updates"} <= set(events_of_run.Tags()["scalars"])
 
 
-CODE = """
+PYPROJECT = """
+[build-system]
+requires = ["setuptools"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "acme-league"
+version = "1.0"
+
+[project.entry-points."policy_league.algorithms"]
+acme = "acme_league:Acme"
+
+[tool.setuptools]
+py-modules = ["acme_league"]
+"""
+
+
+PACKAGE = """
+import json
+
+import torch
+from pettingzoo.utils.wrappers import BaseWrapper
+
 from league.config.ppo import PPOConfig
-from torch import nn
 from training.algorithms.ppo import PPO
 from training.learners.ppo import PPOLearner
 
-class Config(PPOConfig):
-    scale: float = 2.0
+
+class Settings(PPOConfig):
+    patience: int = 3
+
 
 class Learner(PPOLearner):
     def update(self, **arguments):
-        assert type(self.settings) is Config and self.settings.scale == 2
+        assert self.settings.patience == 2
         return super().update(**arguments)
 
-class Algorithm(PPO):
-    settings_class = Config
+
+class Acme(PPO):
+    settings_class = Settings
     learner_class = Learner
 
-class Net(nn.Module):
+
+class Net(torch.nn.Module):
     def __init__(self, space, width):
         super().__init__()
         self.width = width
-        self.layers = nn.Sequential(nn.Flatten(), nn.Linear(18, width), nn.Tanh())
+        self.layers = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(18, width), torch.nn.Tanh())
 
     def forward(self, observations):
         return self.layers(observations["observation"].float())
+
+
+class Episodes:
+    def on_episode(self, episode):
+        return {"plies": episode.length}
+
+
+class Shaped(BaseWrapper):
+    def last(self, observe=True):
+        observation, reward, *ended = super().last(observe)
+        return observation, reward - 0.01, *ended
+
+
+class First:
+    def act(self, observation, action_mask):
+        return int(action_mask.argmax())
+
+
+class Journal:
+    def __init__(self, run):
+        self.file = run.path / "journal.jsonl"
+
+    def write(self, *entry):
+        with self.file.open("a") as file:
+            file.write(json.dumps(entry) + "\\n")
+
+    def log(self, values, step):
+        self.write("curves", sorted(values), step)
+
+    def add(self, ref, files, about):
+        self.write("version", ref, sorted(file.name for file in files.iterdir()))
+
+    def end(self, state):
+        self.write("end", state)
 """
+
+
+LEAGUE = {
+    "league": "acme",
+    "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
+    "training": SHORT
+    | {
+        "algorithm": "acme",
+        "patience": 2,
+        "network": {"entry_point": "acme_league:Net", "kwargs": {"width": 16}},
+        "callbacks": ["acme_league:Episodes"],
+        "wrappers": ["acme_league:Shaped"],
+        "trackers": ["acme_league:Journal"],
+        "opponents": [{"ref": "script:acme_league:First", "share": 0.5}],
+        "steps": 256,
+        "runners": 1,
+        "train_batch_size": 128,
+        "minibatch_size": 64,
+        "strength": None,
+    },
+    "gate": {"anchors": ["script:acme_league:First"]},
+}
+
+
 SERVER = """
 import sys
 from importlib.util import find_spec
@@ -163,41 +259,52 @@ from tests.support.servers.replicas import replica
 
 with replica(Storage.at(Path(sys.argv[1]))) as client:
     rows = {"observation": [[[0, 0]] * 3] * 3, "action_mask": [0, 0, 0, 0, 1, 0, 0, 0, 0]}
-    print(client.post("/v1/policies/own_net/action?version=1", json={"observation": rows}).json())
-    print(client.get("/v1/leagues/own_net").json())
-assert find_spec("own_net_of_test") is None
+    print(client.post("/v1/policies/acme/action", json={"observation": rows}).json())
+assert find_spec("acme_league") is None
 assert "torch" not in sys.modules
 """
 
 
-@pytest.mark.usefixtures("ray_session")
-def test_a_server_without_the_code_of_the_network_and_the_algorithm(registry: Registry, tmp_path: Path) -> None:
-    folder = tmp_path / "league"
-    folder.mkdir()
-    (folder / "own_net_of_test.py").write_text(CODE)
-    network = {"entry_point": "own_net_of_test:Net", "kwargs": {"width": 16}}
-    document = {
-        "league": "own_net",
-        "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
-        "training": SHORT
-        | {"algorithm": "own_net_of_test:Algorithm", "network": network, "runners": 1, "steps": 128, "strength": None},
-    }
-    (folder / "own_net.yaml").write_text(yaml.safe_dump(document))
-    config = LeagueConfig.load(folder / "own_net.yaml")
-    output = io.StringIO()
-    (version,) = train(config, registry=registry, console=Console(file=output, width=200))
-    assert version.manifest.settings["network"] == network
-    assert version.manifest.settings["scale"] == 2
-    assert registry.leagues.get("own_net").config.training.algorithm == "own_net_of_test:Algorithm"
-    (run,) = (registry.storage.home / "runs/own_net").iterdir()
-    record = RunRecord.model_validate_json((run / RUN_FILE).read_text())
-    assert record.code == config.training_code()
-    assert f"Code: own_net_of_test:Net, SHA-256 {record.code['own_net_of_test:Net']}." in output.getvalue()
-    (folder / "own_net_of_test.py").unlink()
-    served = subprocess.run(
-        [sys.executable, "-c", SERVER, str(registry.storage.home)], capture_output=True, text=True, check=False
-    )
-    assert served.returncode == 0, served.stderr
-    answer, league = served.stdout.splitlines()
-    assert "'action': 4" in answer
-    assert "own_net" in league
+def run(*command: str | Path) -> str:
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+def test_a_package_trains_what_a_replica_without_it_serves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is installed in an environment of its own; the replica has neither its code nor torch."""
+    package, environment, home = tmp_path / "package", tmp_path / "venv", tmp_path / "home"
+    package.mkdir()
+    (package / "pyproject.toml").write_text(PYPROJECT)
+    (package / "acme_league.py").write_text(PACKAGE)
+    venv.create(environment, symlinks=True)
+    python = environment / "bin/python"
+    (site_packages,) = environment.glob("lib/python*/site-packages")
+    # In addition to its own: what this process has, the product included.
+    paths = [path for path in sys.path if path and os.path.isdir(path)]
+    # Those of the project are not on the path if it is installed as editable.
+    project = [str(Path(module.__file__ or "").parents[1]) for module in (policy_league, policy_league_client)]
+    paths = [*project, *paths, sysconfig.get_path("purelib")]
+    (site_packages / "checkout.pth").write_text("\n".join(dict.fromkeys(paths)))
+    run(python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index", package)
+    league = tmp_path / "acme.yaml"
+    league.write_text(yaml.safe_dump(LEAGUE))
+    command = [python, "-c", "from policy_league.cli.main import run; run()"]
+    monkeypatch.setenv("LEAGUE_HOME", str(home))
+    output = run(*command, "train", league)
+    assert "plies" in output
+    run(*command, "promote", "acme@1", "--yes")
+    registry = Registry.open(Storage.at(home))
+    (version,) = registry.versions.all("acme")
+    settings = version.manifest.settings
+    assert (version.manifest.algorithm, settings["patience"]) == ("acme_league:Acme", 2)
+    assert settings["network"] == LEAGUE["training"]["network"]
+    registry.close()
+    (directory,) = (home / "runs/acme").iterdir()
+    code = RunRecord.model_validate_json((directory / RUN_FILE).read_text()).code
+    for name in ("Acme", "Net"):
+        assert f"acme_league:{name}, SHA-256 {code[f'acme_league:{name}']}" in output
+    journal = (directory / "journal.jsonl").read_text()
+    assert '["version", "acme@1", [' in journal
+    assert '["end", "ended"]' in journal
+    assert "'action': 4" in run(sys.executable, "-c", SERVER, home)

@@ -2,7 +2,8 @@
 
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -22,6 +23,14 @@ def copy_of(build: Callable[[Storage], Registry], storage: Storage) -> Registry:
     copy_rows(source, copied)
     source.close()
     return copied
+
+
+@contextmanager
+def copied(home: Path, to: Path) -> Iterator[Registry]:
+    """A copy of a home, which a test may change."""
+    registry = Registry.open(Storage.at(Path(shutil.copytree(home, to))))
+    yield registry
+    registry.close()
 
 
 @cache

@@ -1,6 +1,11 @@
+"""A report: its documents, what programs get of them, and one file with all pages, in which no text can run."""
+
 import base64
 import json
+import re
+from base64 import b64decode
 from collections.abc import Iterator
+from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
 from threading import Event, Thread
@@ -19,13 +24,16 @@ from league.errors import EnvironmentMismatch, UnknownLeague
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from policy_league.cli.evaluation import report_contents as module
-from policy_league.cli.evaluation.report_contents import league_report, plain_document
+from policy_league.cli.evaluation.report_contents import league_report, plain_document, report_file
 from serve_app.openapi.document import document
+from serve_app.routes.pages import FILES
 from tests.support.leagues import reported_league, tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.servers.replicas import QUICK
 
 BASE = f"/v1/leagues/{LEAGUE}"
+
+
 SCHEMAS = {
     BASE: "League",
     f"{BASE}/leaderboard": "Leaderboard",
@@ -88,36 +96,25 @@ def test_lists_are_whole(registry: Registry, report: dict[str, Any], monkeypatch
     assert ([version["version"] for version in versions["versions"]], versions["next"]) == ([3, 2, 1], None)
 
 
-def test_what_only_a_running_server_has_is_left_out(report: dict[str, Any]) -> None:
-    about = report["documents"][BASE]
+def test_the_plain_document_has_all_results(registry: Registry, report: dict[str, Any], plain: dict[str, Any]) -> None:
+    """Without what only a running server has."""
+    documents = report["documents"]
+    about = documents[BASE]
     assert (about["replicas"], about["faults"], about["summary"]["earlier"]) == ([], [], [])
     assert (about["traffic"]["canary"], about["traffic"]["shadow"], about["up_to_date"]) == (None, None, True)
-
-
-def test_the_plain_document_has_all_results(registry: Registry, report: dict[str, Any], plain: dict[str, Any]) -> None:
-    documents = report["documents"]
     assert (plain["league"], plain["champion"], plain["made_at"]) == (LEAGUE, "tictactoe@3", report["made_at"])
-    matches = Ledger(registry).matches(league=LEAGUE)
+    matches, rows = Ledger(registry).matches(league=LEAGUE), registry.verdicts.all(LEAGUE)
     assert plain["games"] == sum(len(match.games) for match in matches) > plain["unique_games"]
     assert plain["environment"] == "pettingzoo.classic.tictactoe_v3"
     assert plain["leaderboard"] == documents[f"{BASE}/leaderboard"]["leaderboard"]
     assert (plain["by_side"], plain["roles"], plain["left_out"]) == ({}, {}, [])
-    table = documents[f"{BASE}/payoff"]["payoff"]
-    assert plain["payoff"] | {"shares": plain["shares"]} == table
+    assert plain["payoff"] | {"shares": plain["shares"]} == documents[f"{BASE}/payoff"]["payoff"]
     assert {share["ref"] for share in plain["shares"]} == {row["ref"] for row in plain["leaderboard"]}
     assert [version["number"] for version in plain["versions"]] == [1, 2, 3]
-    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
-
-
-def test_verdicts_are_listed_newest_first_with_their_evidence(registry: Registry, plain: dict[str, Any]) -> None:
-    rows = registry.verdicts.all(LEAGUE)
-    assert [verdict["verdict"] for verdict in plain["verdicts"]] == [row.id for row in reversed(rows)]
+    assert [verdict["verdict"] for verdict in plain["verdicts"]] == [row.id for row in reversed(rows)], "newest first"
     for verdict in plain["verdicts"]:
         assert verdict["curve"][-1] == [verdict["blocks"], verdict["llr"]]
         assert str(verdict["games"]) in verdict["reason"]
-
-
-def test_promotions_have_kind_actor_and_reason(plain: dict[str, Any]) -> None:
     assert [(event["kind"], event["champion"], event["before"]) for event in plain["promotions"]] == [
         ("rollback", "tictactoe@3", "tictactoe@1"),
         ("by hand", "tictactoe@1", "tictactoe@3"),
@@ -126,9 +123,12 @@ def test_promotions_have_kind_actor_and_reason(plain: dict[str, Any]) -> None:
     ]
     assert plain["promotions"][1]["reason"] == reported_league.HOSTILE
     assert plain["promotions"][2]["verdict"] == plain["verdicts"][0]["verdict"]
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
 
 
-def test_each_step_of_an_upset_has_its_moves_and_image(registry: Registry, report: dict[str, Any]) -> None:
+def test_each_step_of_an_upset_has_its_moves_and_for_people_an_image(
+    registry: Registry, report: dict[str, Any], plain: dict[str, Any]
+) -> None:
     for upset, recording in zip(report["documents"][BASE]["summary"]["upsets"], recordings(report), strict=True):
         game = Ledger(registry).match(upset["match"]).games[upset["game"]]
         moves = [*game.opening, *game.actions]
@@ -136,9 +136,6 @@ def test_each_step_of_an_upset_has_its_moves_and_image(registry: Registry, repor
         assert (recording["length"], recording["every"], recording["fault"]) == (len(moves), 1, None)
         assert [step["opening"] for step in recording["steps"]] == [0 < step <= 2 for step in range(len(moves) + 1)]
         assert len(set(images(recording))) == len(recording["steps"]), "all images differ"
-
-
-def test_programs_get_no_images(plain: dict[str, Any]) -> None:
     assert plain["upsets"]
     for upset in plain["upsets"]:
         assert upset["score"] - upset["expected"] >= 0.4
@@ -146,19 +143,18 @@ def test_programs_get_no_images(plain: dict[str, Any]) -> None:
         assert set(upset["players"].values()) == {upset["better"], upset["other"]}
 
 
-def test_the_size_of_recorded_games_is_limited(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recorded_games_are_limited(
+    registry: Registry, report: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By their bytes and by their steps: a long game keeps some, with the first and the last."""
     limit = 40_000
-    monkeypatch.setattr(module, "MOST_BYTES", limit)
-    games = recordings(league_report(registry, LEAGUE))
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "MOST_BYTES", limit)
+        games = recordings(league_report(registry, LEAGUE))
     assert sum(len(json.dumps(game, separators=(",", ":"))) for game in games) <= limit
     for game in games:
         assert game["every"] > 1
         assert (game["steps"][0]["step"], game["steps"][-1]["step"]) == (0, game["length"])
-
-
-def test_a_long_game_keeps_some_steps_with_the_first_and_the_last(
-    registry: Registry, report: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(service_requests, "MOST_STEPS", 4)
     for long, whole in zip(recordings(league_report(registry, LEAGUE)), recordings(report), strict=True):
         assert long["every"] > 1
@@ -177,16 +173,26 @@ def test_a_game_that_cannot_be_replayed_has_a_reason(registry: Registry, monkeyp
         assert upset["fault"] == f"match {upset['match']} is of another environment"
 
 
+def plain_of(registry: Registry) -> dict[str, Any]:
+    return plain_document(league_report(registry, LEAGUE))
+
+
 def test_an_open_and_a_void_verdict_have_their_reasons(tmp_path: Path) -> None:
+    """Exploiters and mixtures have their roles."""
     with reported_league.empty(tmp_path) as registry:
-        tictactoe.publish(registry, tictactoe.graph())
+        for exploits in (None, "tictactoe@1", None):
+            tictactoe.publish(registry, tictactoe.graph(), exploits=exploits)
+        registry.publisher.publish_mixture(LEAGUE, {1: 0.25, 3: 0.75})
         verdict = open_verdict(registry, registry.leagues.get(LEAGUE), 1, "script:random", alpha=0.001)
-        (opened,) = plain_document(league_report(registry, LEAGUE))["verdicts"]
+        (opened,) = plain_of(registry)["verdicts"]
         registry.verdicts.void(verdict.id, "somebody stopped it")
-        (voided,) = plain_document(league_report(registry, LEAGUE))["verdicts"]
+        plain = plain_of(registry)
+    (voided,) = plain["verdicts"]
     assert (opened["outcome"], opened["reason"][:16], opened["alpha"]) == ("open", "Undecided: after", 0.001)
     assert (voided["outcome"], voided["reason"]) == ("void", "Void: somebody stopped it.")
     assert (voided["anchors"], voided["confirmation"], voided["curve"]) == ([], None, [])
+    mixture = "mixture of @1 25.0 %, @3 75.0 %"
+    assert plain["roles"] == {"tictactoe@4": mixture, "tictactoe@2": "exploiter of tictactoe@1"}
 
 
 def test_anchors_and_confirmations_are_included(tmp_path: Path) -> None:
@@ -194,43 +200,24 @@ def test_anchors_and_confirmations_are_included(tmp_path: Path) -> None:
         for graph in (tictactoe.graph(wins=True), tictactoe.graph(wins=True, blocks=True)):
             tictactoe.publish(registry, graph)
         registry.aliases.set(LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
-        gate = {"anchors": ["script:random"], "margin": 100}
-        nightly(tictactoe.config(gate=gate), registry=registry)
-        newest = plain_document(league_report(registry, LEAGUE))["verdicts"][0]
+        nightly(tictactoe.config(gate={"anchors": ["script:random"], "margin": 100}), registry=registry)
+        newest = plain_of(registry)["verdicts"][0]
     assert newest["promoted"]
     assert [(anchor["ref"], anchor["outcome"]) for anchor in newest["anchors"]] == [("script:random", "not worse")]
     assert newest["confirmation"]["games"] == 40
 
 
-def test_exploiters_and_mixtures_have_their_roles(tmp_path: Path) -> None:
-    with reported_league.empty(tmp_path) as registry:
-        for exploits in (None, "tictactoe@1"):
-            tictactoe.publish(registry, tictactoe.graph(), exploits=exploits)
-        tictactoe.publish(registry, tictactoe.graph(wins=True))
-        registry.publisher.publish_mixture(LEAGUE, {1: 0.25, 3: 0.75})
-        roles = plain_document(league_report(registry, LEAGUE))["roles"]
-    assert roles == {
-        "tictactoe@4": "mixture of @1 25.0 %, @3 75.0 %",
-        "tictactoe@2": "exploiter of tictactoe@1",
-    }
-
-
-def test_an_empty_league_has_a_report(tmp_path: Path) -> None:
-    with reported_league.empty(tmp_path) as registry:
-        plain = plain_document(league_report(registry, LEAGUE))
+def test_an_empty_league_and_one_with_different_sides_have_a_report(tmp_path: Path) -> None:
+    with reported_league.empty(tmp_path / "empty") as registry:
+        plain = plain_of(registry)
         with pytest.raises(UnknownLeague):
             league_report(registry, "chess")
     assert (plain["games"], plain["champion"], plain["payoff"], plain["leaderboard"]) == (0, None, None, [])
     assert (plain["shares"], plain["upsets"], plain["verdicts"], plain["promotions"]) == ([], [], [], [])
-
-
-def test_different_sides_are_rated_separately(tmp_path: Path) -> None:
-    with reported_league.league_with_roles(tmp_path) as registry:
-        plain = plain_document(league_report(registry, LEAGUE))
-    assert plain["scoring"] == "side"
-    assert set(plain["by_side"]) == {"adversary", "good"}
-    for rows in plain["by_side"].values():
-        assert {row["games"] for row in rows} == {10}
+    with reported_league.league_with_roles(tmp_path / "roles") as registry:
+        plain = plain_of(registry)
+    assert (plain["scoring"], set(plain["by_side"])) == ("side", {"adversary", "good"})
+    assert {row["games"] for rows in plain["by_side"].values() for row in rows} == {10}
 
 
 def test_omissions_are_reported(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -263,3 +250,67 @@ def test_a_report_waits_for_another_process_that_computes_the_results(tmp_path: 
             assert league_report(registry, LEAGUE)["documents"][BASE]["up_to_date"]
         waits.assert_called_once()
         other.close()
+
+
+HOSTILE = "</script><script>alert('mine')</script><!-- <script> <img src=x onerror=alert(1)> \u2028 '\"&"
+
+
+REPORT = {"league": HOSTILE, "made_at": HOSTILE, "documents": {HOSTILE: {HOSTILE: [HOSTILE, 1.5, None]}}}
+
+
+class Elements(HTMLParser):
+    """Elements in order as [tag, attributes, text], the text of scripts and styles only."""
+
+    def __init__(self, document: bytes) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None], list[str]]] = []
+        self.feed(document.decode())
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs), []))
+
+    def handle_data(self, data: str) -> None:
+        if self.found:
+            self.found[-1][2].append(data)
+
+    def all(self, tag: str, **attributes: str) -> list[tuple[dict[str, str | None], str]]:
+        return [
+            (attrs, "".join(text))
+            for name, attrs, text in self.found
+            if name == tag and attributes.items() <= attrs.items()
+        ]
+
+
+def test_hostile_text_is_data_in_the_file_and_only_its_own_scripts_and_styles_can_run() -> None:
+    """An HTML parser reads it, as a browser would."""
+    elements = Elements(report_file(REPORT))
+    ((_, data),) = elements.all("script", id="report")
+    assert json.loads(data) == REPORT
+    assert len(elements.all("script")) == 4, "theme, import map, data and the start of the pages"
+    assert not elements.all("img", src="x")
+    ((attributes, _),) = elements.all("meta", **{"http-equiv": "Content-Security-Policy"})
+    rules = dict(rule.split(" ", 1) for rule in (attributes["content"] or "").split("; "))
+    assert rules["default-src"] == rules["base-uri"] == rules["form-action"] == "'none'"
+    assert (rules["img-src"], rules["script-src"]) == ("data:", rules["style-src"])
+    (nonce,) = re.findall(r"^'nonce-([\w-]{40,})'$", rules["script-src"])
+    code = [attrs for tag, attrs, _ in elements.found if tag in ("script", "style") and attrs.get("id") != "report"]
+    assert len(code) > 5
+    assert {attrs["nonce"] for attrs in code} == {nonce}
+    assert report_file(REPORT).count(nonce.encode()) == 0, "every file has its own"
+    for tag, attributes, _ in elements.found:
+        assert tag not in {"iframe", "object", "embed", "form", "base"}, "it refers to nothing else"
+        for name in ("src", "href", "srcset", "action"):
+            assert (attributes.get(name) or "#").startswith(("data:", "#")) or (tag, attributes.get(name)) == ("a", "/")
+
+
+def test_the_import_map_contains_all_modules_with_names_that_it_maps() -> None:
+    ((_, text),) = Elements(report_file(REPORT)).all("script", type="importmap")
+    imports = json.loads(text)["imports"]
+    assert imports.keys() == {path.relative_to(FILES).as_posix() for path in FILES.rglob("*.js")}
+    for name, url in imports.items():
+        kind, _, data = url.partition(";base64,")
+        assert kind == "data:text/javascript"
+        code = b64decode(data).decode()
+        assert code.replace('"./', '"') == (FILES / name).read_text().replace('"./', '"')
+        assert set(re.findall(r'(?:from |import\()"(.+?)"', code)) <= imports.keys(), name

@@ -9,6 +9,7 @@ import pytest
 from sqlalchemy import select
 
 from evaluation.gating.nightly import nightly
+from evaluation.gating.verdicts import conclude, open_verdict
 from evaluation.gating.verification import verify
 from evaluation.matches.game_records import forfeits
 from league.environments.implementation import implementation
@@ -20,7 +21,7 @@ from league.results.ledger import Ledger
 from league.settings import Storage
 from tests.support.databases import StorageAt, on_both_databases
 from tests.support.leagues import tictactoe
-from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, WEAK, league_of
+from tests.support.leagues.judged_league import CONFIG, MIDDLING, STRONG, WEAK, league_of, promote
 from tests.support.policies.illegal_action_graph import illegal_action_graph
 from tests.support.templates import copy_of
 
@@ -53,25 +54,15 @@ def verdicts(registry: Registry) -> list[VerdictRow]:
 def test_all_verdicts_of_a_run_are_verified_by_replay(gated: Registry) -> None:
     assert {row.outcome for row in verdicts(gated)} >= {"promote", "reject"}
     for row in verdicts(gated):
-        found = verify(row.id, registry=gated, replays=5)
-        assert (found.outcome, found.replayed) == (row.outcome, 5)
-        assert found.matches >= row.evidence["blocks"]  # type: ignore[index]
+        result = verify(row.id, registry=gated, replays=5)
+        assert (result.outcome, result.replayed) == (row.outcome, 5)
+        assert result.matches >= row.evidence["blocks"]
+        assert verify(row.id, registry=Registry.open(gated.storage), replays=5) == result
 
 
 def test_games_are_replayed_in_the_stock_environment(gated: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    vector = implementation(CONFIG.environment).vector
-    assert vector is not None
-
-    def fail(*_: Any) -> None:
-        raise RuntimeError("the vectorised environment was used")
-
-    monkeypatch.setattr(vector, "step", fail)
+    monkeypatch.setattr(implementation(CONFIG.environment).vector, "step", None)
     assert verify(verdicts(gated)[-1].id, registry=gated, replays=3).replayed == 3
-
-
-def test_verification_is_reproducible_with_another_registry(gated: Registry) -> None:
-    row = verdicts(gated)[0]
-    assert verify(row.id, registry=Registry.open(gated.storage)) == verify(row.id, registry=gated)
 
 
 CHANGES: dict[str, Any] = {
@@ -92,15 +83,14 @@ CHANGES: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("name", CHANGES)
-def test_each_change_of_the_evidence_is_reported(registry: Registry, name: str) -> None:
+def test_each_change_of_the_evidence_is_reported(registry: Registry, subtests: pytest.Subtests) -> None:
     row = verdicts(registry)[0]
     assert row.outcome == "promote"
-    with registry.database.write() as session:
-        stored = session.get_one(rows.VerdictRow, row.id)
-        stored.evidence = {**stored.evidence, name: CHANGES[name]}  # type: ignore[dict-item]
-    with pytest.raises(VerdictRefuted, match=f"{name} is .*but the games give"):
-        verify(row.id, registry=registry)
+    for name, value in CHANGES.items():
+        with registry.database.write() as session:
+            session.get_one(rows.VerdictRow, row.id).evidence = {**row.evidence, name: value}
+        with subtests.test(name), pytest.raises(VerdictRefuted, match=f"{name} is .*but the games give"):
+            verify(row.id, registry=registry)
 
 
 def change_moves(registry: Registry, verdict: str, change: Callable[[list[Any]], None], position: int = 0) -> None:
@@ -111,7 +101,12 @@ def change_moves(registry: Registry, verdict: str, change: Callable[[list[Any]],
         match.moves = json.dumps(moves)
 
 
-def test_a_score_that_contradicts_the_returns_is_detected(registry: Registry) -> None:
+def shorten(moves: list[Any]) -> None:
+    for game in moves[2]:
+        game[1] = game[1][:-1]
+
+
+def test_a_score_that_contradicts_the_returns_and_a_missing_match_are_detected(registry: Registry) -> None:
     row = verdicts(registry)[0]
 
     def change(moves: list[Any]) -> None:
@@ -121,25 +116,16 @@ def test_a_score_that_contradicts_the_returns_is_detected(registry: Registry) ->
     change_moves(registry, row.id, change)
     with pytest.raises(VerdictRefuted, match="contradicts its schedule"):
         verify(row.id, registry=registry)
-
-
-def test_a_missing_match_is_detected(registry: Registry) -> None:
-    row = verdicts(registry)[0]
     with registry.database.write() as session:
-        session.delete(session.scalars(select(tables.MatchTable).filter_by(schedule=row.id, position=1)).one())
-    with pytest.raises(VerdictRefuted, match="lacks match 1 of"):
+        session.delete(session.scalars(select(tables.MatchTable).filter_by(schedule=row.id, position=0)).one())
+    with pytest.raises(VerdictRefuted, match="lacks match 0 of"):
         verify(row.id, registry=registry)
 
 
 def test_a_modified_game_is_detected_by_the_sums_and_by_replay(registry: Registry) -> None:
     """With the sums changed as well, consistent returns and scores are accepted until the game is replayed."""
     row = verdicts(registry)[0]
-
-    def change(moves: list[Any]) -> None:
-        for game in moves[2]:
-            game[1] = game[1][:-1]
-
-    change_moves(registry, row.id, change)
+    change_moves(registry, row.id, shorten)
     with pytest.raises(VerdictRefuted, match=r"the sums of schedule .* contradict its games: .*game_digests of 0"):
         verify(row.id, registry=registry)
     ledger = Ledger(registry)
@@ -152,12 +138,7 @@ def test_a_modified_game_is_detected_by_the_sums_and_by_replay(registry: Registr
 def test_a_changed_environment_is_named_as_the_cause(registry: Registry) -> None:
     """The moves stand for a changed `step`: either way the game does not end as recorded."""
     row = verdicts(registry)[0]
-
-    def change(moves: list[Any]) -> None:
-        for game in moves[2]:
-            game[1] = game[1][:-1]
-
-    change_moves(registry, row.id, change)
+    change_moves(registry, row.id, shorten)
     league = registry.leagues.get(tictactoe.LEAGUE)
     environment = league.config.environment.model_copy(update={"revision": "2"})
     registry.leagues.register(league.config.model_copy(update={"environment": environment}), league.interface)
@@ -165,15 +146,14 @@ def test_a_changed_environment_is_named_as_the_cause(registry: Registry) -> None
         verify(row.id, registry=registry, replays=2)
 
 
-def test_a_void_verdict_is_verified_as_far_as_it_was_tested(tmp_path: Path) -> None:
+def test_only_closed_verdicts_can_be_verified_and_a_void_one_as_far_as_it_was_tested(tmp_path: Path) -> None:
     registry = league_of(tmp_path, STRONG, WEAK)
-    row = registry.leagues.get(tictactoe.LEAGUE)
-    from evaluation.gating.verdicts import conclude, open_verdict
-
-    open_verdict(registry, row, 2, "script:random")
-    registry.aliases.set(tictactoe.LEAGUE, "champion", 1, expected=None, actor="me", reason="first")
-    (verdict,) = verdicts(registry)
-    assert conclude(registry, verdict).outcome == "void"
+    with pytest.raises(NotFound, match="no verdict 'x'"):
+        verify("x", registry=registry)
+    verdict = open_verdict(registry, registry.leagues.get(tictactoe.LEAGUE), 2, "script:random")
+    with pytest.raises(InvalidInput, match="is still open"):
+        verify(verdict.id, registry=registry)
+    assert conclude(promote(registry, 1), verdict).outcome == "void"
     assert verify(verdict.id, registry=registry).outcome == "void"
 
 
@@ -195,14 +175,3 @@ def test_a_verdict_with_forfeits_is_verified(tmp_path: Path) -> None:
         change_moves(registry, row.id, change, match)
     with pytest.raises(VerdictRefuted, match="which did not have to act then"):
         verify(row.id, registry=registry, replays=8)
-
-
-def test_only_closed_verdicts_can_be_verified(tmp_path: Path) -> None:
-    registry = league_of(tmp_path, STRONG)
-    with pytest.raises(NotFound, match="no verdict 'x'"):
-        verify("x", registry=registry)
-    from evaluation.gating.verdicts import open_verdict
-
-    verdict = open_verdict(registry, registry.leagues.get(tictactoe.LEAGUE), 1, "script:random")
-    with pytest.raises(InvalidInput, match="is still open"):
-        verify(verdict.id, registry=registry)

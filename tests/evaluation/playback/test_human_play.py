@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from base64 import b64decode
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
@@ -16,13 +16,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
+from pettingzoo.classic import connect_four_v3
 from PIL import Image
 
-from evaluation.playback.environment_hooks import Declarations, EnvironmentHooks, environment_hooks
+from evaluation.playback.environment_hooks import KNOWN, Declarations, EnvironmentHooks, environment_hooks
 from evaluation.playback.human_play import PERSON, human_play, playability
 from evaluation.playback.single_game import GameStep, play_game
 from league.conditions import ActionSelection
+from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.lockstep import stock_stepping
@@ -32,16 +35,26 @@ from league.interface import Interface
 from league.policies.loading import contestant
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions, Arrays, Policy
-from league.service_requests import GameForfeit, HumanPlayRequest, PlayedGame
+from league.registry.registry import Registry
+from league.service_requests import GameForfeit, HumanPlayRequest, Playability, PlayedGame, RecordedStep
 from league.spaces import inputs
 from tests.support.environments.declaring import EVERYTHING, VIEWS
 from tests.support.leagues import tictactoe
-from tests.support.leagues.judged_league import STRONG, WEAK
+from tests.support.leagues.judged_league import STRONG, WEAK, promote
 
 TICTACTOE = "pettingzoo.classic.tictactoe_v3"
+
+
 CONNECT_FOUR = "pettingzoo.classic.connect_four_v3"
+
+
 SPREAD = "mpe2.simple_spread_v3"
+
+
 BRIEF = {"max_cycles": 8}
+
+
+DECLARING = "tests.support.environments.declaring"
 UNSEEN = EnvironmentHooks(draws=False, has_views=False, declared=Declarations())
 
 
@@ -50,13 +63,8 @@ def league_and_environment(
     entry_point: str, selection: ActionSelection | None = None, **kwargs: Any
 ) -> tuple[LeagueConfig, Interface, BatchedEnvironment]:
     """A league, and an environment that is reused for several games."""
-    config = LeagueConfig.from_mapping(
-        {
-            "league": "home",
-            "environment": {"entry_point": entry_point, "kwargs": dict(kwargs)},
-            "play": {"actions": selection},
-        }
-    )
+    environment = {"entry_point": entry_point, "kwargs": dict(kwargs)}
+    config = LeagueConfig.from_mapping({"league": "home", "environment": environment, "play": {"actions": selection}})
     return config, interface(config), stock_stepping(config.environment, 1)
 
 
@@ -88,12 +96,8 @@ class Scripted:
         return Actions(np.array([next(self._choices)]))
 
 
-def moves_of(steps: Sequence[GameStep]) -> list[list[tuple[str, Any]]]:
+def moves_of(steps: Sequence[GameStep] | Sequence[RecordedStep]) -> list[list[tuple[str, Any]]]:
     return [[(move.agent, move.action) for move in step.moves] for step in steps]
-
-
-def moves_in(state: PlayedGame) -> list[list[tuple[str, Any]]]:
-    return [[(move.agent, move.action) for move in step.moves] for step in state.steps]
 
 
 @pytest.mark.parametrize(("entry_point", "kwargs"), [(TICTACTOE, {}), (CONNECT_FOUR, {}), (SPREAD, BRIEF)])
@@ -116,7 +120,7 @@ def test_a_game_is_reproducible_for_any_prefix_and_equals_one_of_policies(
         assert again == so_far[number]
         assert whole.steps[: len(again.steps)] == again.steps
     played = list(play_game(environment, {**players, agent: Scripted(choices)}, seed))
-    assert moves_in(whole) == moves_of(played)
+    assert moves_of(whole.steps) == moves_of(played)
     assert whole.returns == played[-1].returns
     assert {move.ref for step in whole.steps for move in step.moves if move.agent == agent} == {PERSON}
 
@@ -134,7 +138,7 @@ def test_playing_like_the_opponent_equals_self_play_of_the_opponent(memory: bool
     while not (state := play_request(SPREAD, players, "agent_1", choices, **options)).over:
         assert sum(chance for _, chance in state.chances) == pytest.approx(1, abs=1e-5)
         choices.append(state.chances[0][0] if selection == "greedy" else drawn[len(choices)])
-    assert moves_in(state) == played
+    assert moves_of(state.steps) == played
     assert len(set(choices)) > 1 or not memory
     is_likeliest = {move.chances[0][0] == move.action for step in state.steps for move in step.moves}
     assert is_likeliest == ({True} if selection == "greedy" else {True, False})
@@ -179,16 +183,12 @@ def test_advice_depends_on_the_actions_actually_played() -> None:
     assert [advice_after(), advice_after(0), advice_after(3), advice_after(3, 1), advice_after(3, 4)] == [0, 1, 4, 2, 0]
 
 
-def test_probabilities_are_returned_on_request_only() -> None:
+def test_probabilities_are_returned_on_request_and_certain_without_a_distribution() -> None:
     _, described, _ = league_and_environment(TICTACTOE)
     players = all_agents(described, OnnxPolicy(tictactoe.graph(wins=True)))
     state = play_request(TICTACTOE, players, "player_2")
     assert (state.chances, {move.chances for step in state.steps for move in step.moves}) == ((), {()})
     assert play_request(TICTACTOE, scripted_players(described), "player_2", chances=True).chances == ()
-
-
-def test_the_action_of_an_opponent_without_a_distribution_is_certain() -> None:
-    _, described, _ = league_and_environment(TICTACTOE)
     players = all_agents(described, OnnxPolicy(tictactoe.graph(wins=True), has_distribution=False))
     state = play_request(TICTACTOE, players, "player_2", chances=True)
     (move,) = state.steps[1].moves
@@ -196,35 +196,24 @@ def test_the_action_of_an_opponent_without_a_distribution_is_certain() -> None:
     assert [chance for _, chance in state.chances] == [1.0]
 
 
-def test_the_state_has_the_legal_actions_of_the_person() -> None:
+def test_the_state_has_the_legal_actions_of_the_person_and_others_are_rejected() -> None:
     players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph()))
     first = play_request(TICTACTOE, players, "player_1")
     assert (first.legal, first.acting, first.over, len(first.steps)) == (tuple(range(9)), ("player_1",), False, 1)
     second = play_request(TICTACTOE, players, "player_1", [4])
-    assert moves_in(second)[1:] == [[("player_1", 4)], [("player_2", 1)]]
+    assert moves_of(second.steps)[1:] == [[("player_1", 4)], [("player_2", 1)]]
     assert second.legal == (0, 2, 3, 5, 6, 7, 8)
+    for actions, message in (([4, 4], r"\[1\]: 4 is illegal"), ([9], r"\[0\]: 9 is illegal"), ([-1], "-1")):
+        with pytest.raises(IllegalAction, match=f"{message}.*expected one of .*2.*3.*8$"):
+            play_request(TICTACTOE, players, "player_1", actions)
 
 
-@pytest.mark.parametrize(("opponent", "choices", "score"), [("first", [2, 4, 6], 1.0), ("first", [3, 4, 8], 0.0)])
-def test_the_result_of_a_game_is_reported(opponent: str, choices: list[int], score: float) -> None:
-    state = play_request(
-        TICTACTOE, scripted_players(league_and_environment(TICTACTOE)[1], opponent), "player_1", choices
-    )
-    assert (state.over, state.score, state.legal, state.acting) == (True, score, (), ())
-    assert state.returns == {"player_1": 2 * score - 1, "player_2": 1 - 2 * score}
-
-
-@pytest.mark.parametrize(
-    ("actions", "message"), [([4, 4], r"\[1\]: 4 is illegal"), ([9], r"\[0\]: 9 is illegal"), ([-1], "-1")]
-)
-def test_an_illegal_choice_is_rejected_with_the_legal_ones(actions: list[int], message: str) -> None:
-    players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph()))
-    with pytest.raises(IllegalAction, match=f"{message}.*expected one of .*2.*3.*8$"):
-        play_request(TICTACTOE, players, "player_1", actions)
-
-
-def test_choices_after_the_end_are_rejected() -> None:
+def test_the_result_of_a_game_is_reported() -> None:
     players = scripted_players(league_and_environment(TICTACTOE)[1], "first")
+    for choices, score in (([2, 4, 6], 1.0), ([3, 4, 8], 0.0)):
+        state = play_request(TICTACTOE, players, "player_1", choices)
+        assert (state.over, state.score, state.legal, state.acting) == (True, score, (), ())
+        assert state.returns == {"player_1": 2 * score - 1, "player_2": 1 - 2 * score}
     with pytest.raises(InvalidInput, match="ended after 3 of 5"):
         play_request(TICTACTOE, players, "player_1", [2, 4, 6, 7, 8])
 
@@ -239,105 +228,134 @@ def test_a_person_can_play_only_agents_with_discrete_actions() -> None:
         play_request(SPREAD, players, "agent_0", kwargs=kwargs)
 
 
-def test_an_opponent_without_a_legal_action_forfeits() -> None:
-    players = all_agents(league_and_environment(TICTACTOE)[1], OnnxPolicy(tictactoe.graph(faulty=True)))
-    state = play_request(TICTACTOE, players, "player_1", [1, 5, 8])
+def test_an_opponent_without_a_legal_action_forfeits_but_not_one_that_is_unreachable() -> None:
+    described = league_and_environment(TICTACTOE)[1]
+    faulty = all_agents(described, OnnxPolicy(tictactoe.graph(faulty=True)))
+    state = play_request(TICTACTOE, faulty, "player_1", [1, 5, 8])
     assert state.forfeits == (GameForfeit(agent="player_2", ref="script:random", reason="illegal_action"),)
     assert state.score == 1.0
 
-
-def test_an_unreachable_opponent_does_not_forfeit() -> None:
     class Unreachable(Scripted):
         def act(self, observations: Arrays, *, state: Any = None, explore: bool = False, rng: Any = None) -> Actions:
             raise RemoteError("http://127.0.0.1:9/v2/models/board cannot be reached")
 
-    players = all_agents(league_and_environment(TICTACTOE)[1], Unreachable([]))
     with pytest.raises(RemoteError, match="cannot be reached"):
-        play_request(TICTACTOE, players, "player_1", [4])
-
-
-def test_an_exception_of_the_environment_is_reported() -> None:
-    players = scripted_players(league_and_environment("tests.support.environments.hanging:Raising")[1])
+        play_request(TICTACTOE, all_agents(described, Unreachable([])), "player_1", [4])
+    raising = "tests.support.environments.hanging:Raising"
     with pytest.raises(GameCrashed, match="ValueError: the board is gone"):
-        play_request("tests.support.environments.hanging:Raising", players, "player_1", [4])
+        play_request(raising, scripted_players(league_and_environment(raising)[1]), "player_1", [4])
 
 
 def test_the_picture_is_the_view_of_the_agent_if_the_environment_has_one() -> None:
-    entry_point = "tests.support.environments.declaring:Declaring"
-    config = LeagueConfig.from_mapping({"league": "home", "environment": {"entry_point": entry_point}})
-    described, hooks = interface(config), environment_hooks(config.environment)
+    config, described, _ = league_and_environment(f"{DECLARING}:Declaring")
+    hooks, players = environment_hooks(config.environment), scripted_players(described, "first")
     environment = stock_stepping(config.environment, 1, render_mode="rgb_array")
-    players = scripted_players(described, "first")
 
     def brightness(hooks: EnvironmentHooks, agent: str) -> int:
         request = HumanPlayRequest(opponent="script:first", agent=agent)
         picture = human_play(request, config, described, players, None, environment, hooks).picture
-        assert picture is not None
         return int(np.asarray(Image.open(BytesIO(b64decode(picture.partition(",")[2]))).convert("L"))[0, 0])
 
     whole = replace(hooks, has_views=False)
-    shown = [brightness(hooks, "player_1"), brightness(hooks, "player_2"), brightness(whole, "player_2")]
-    assert shown == [VIEWS["player_1"], VIEWS["player_2"], EVERYTHING]
+    views = [brightness(hooks, "player_1"), brightness(hooks, "player_2"), brightness(whole, "player_2")]
+    assert views == [VIEWS["player_1"], VIEWS["player_2"], EVERYTHING]
 
 
-@pytest.mark.parametrize(("entry_point", "reveals"), [("Declaring", False), ("Revealing", True), ("Open", False)])
-def test_pictures_that_reveal_hidden_information_are_reported(tmp_path: Path, entry_point: str, reveals: bool) -> None:
-    config = tictactoe.config(environment={"entry_point": f"tests.support.environments.declaring:{entry_point}"})
-    described = interface(config)
-    with closing(tictactoe.registry(tmp_path)) as registry:
-        registry.leagues.register(config, described)
-        found = playability(config, registry, described, environment_hooks(config.environment))
-    assert (found.draws, found.reveals) == (True, reveals)
+def playable(registry: Registry, config: LeagueConfig) -> Playability:
+    """What a league with this configuration offers to people."""
+    registry.leagues.register(config, interface(config))
+    return playability(config, registry, interface(config), environment_hooks(config.environment))
 
 
-def test_agents_have_the_declared_names_keys_and_colors(tmp_path: Path) -> None:
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    with closing(tictactoe.registry(tmp_path)) as opened:
+        yield opened
+
+
+def test_agents_have_the_declared_names_keys_and_colors_and_revealing_pictures_are_reported(registry: Registry) -> None:
+    for name, reveals in (("Declaring", False), ("Revealing", True), ("Open", False)):
+        offer = playable(registry, tictactoe.config(environment={"entry_point": f"{DECLARING}:{name}"}))
+        assert (offer.draws, offer.reveals) == (True, reveals), name
     names = ["left", *"bcdefgh", "right"]
-    config = tictactoe.config(
-        environment={"entry_point": "tests.support.environments.declaring:Declaring"}, play={"action_names": names}
-    )
-    described = interface(config)
-    with closing(tictactoe.registry(tmp_path)) as registry:
-        registry.leagues.register(config, described)
-        found = playability(config, registry, described, environment_hooks(config.environment))
-    first, second = found.agents
+    declaring = {"entry_point": f"{DECLARING}:Declaring"}
+    offer = playable(registry, tictactoe.config(environment=declaring, play={"action_names": names}))
+    first, second = offer.agents
     assert first.names == {str(action): name for action, name in enumerate(names)}
     assert first.keys == {"ArrowLeft": 0, "a": 0, "ArrowRight": 8, "d": 4}, "declared keys precede; 99 is no action"
     assert (first.color, second.color) == ("red", None)
-    assert found.board == ((0, None), (1, 2))
+    assert offer.board == ((0, None), (1, 2))
 
 
-def test_scripts_of_the_configuration_are_offered_if_they_can_play(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_opponents_that_can_play_are_offered(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scripts of the configuration, and versions and mixtures of the environment."""
     monkeypatch.setitem(sys.modules, "pyspiel", None)  # `mcts_100` needs it
+    anchors = ["script:minimax_2", "script:mirror", "script:mcts_100"]
     opponents = [{"ref": f"script:{name}", "share": 0.1} for name in ("solver", "one_ply")]
-    config = tictactoe.config(
-        gate={"anchors": ["script:minimax_2", "script:mirror", "script:mcts_100"]}, training={"opponents": opponents}
+    config = tictactoe.config(gate={"anchors": anchors}, training={"opponents": opponents})
+    assert playable(registry, config).opponents == (
+        "script:random",
+        "script:one_ply",
+        "script:minimax_2",
+        "script:solver",
     )
-    described = interface(config)
-    with closing(tictactoe.registry(tmp_path)) as registry:
-        registry.leagues.register(config, described)
-        found = playability(config, registry, described, environment_hooks(config.environment))
-    assert found.opponents == ("script:random", "script:one_ply", "script:minimax_2", "script:solver")
+    for graph in (STRONG, WEAK):
+        tictactoe.publish(registry, graph)
+    registry.publisher.publish_mixture(tictactoe.LEAGUE, {1: 0.5, 2: 0.5})
+    promote(registry, 3)
+    other = tictactoe.config(environment={"entry_point": TICTACTOE, "kwargs": {"screen_height": 500}})
+    for league, versions in ((config, {"tictactoe@1", "tictactoe@2", "tictactoe@3"}), (other, set())):
+        refs = playable(registry, league).opponents
+        assert {ref for ref in refs if not ref.startswith("script:")} == versions
 
 
-def test_mixtures_of_another_environment_are_not_offered(tmp_path: Path) -> None:
-    entry_point = "pettingzoo.classic.tictactoe_v3"
-    before, now = (
-        tictactoe.config(environment={"entry_point": entry_point, "kwargs": {"screen_height": height}})
-        for height in (400, 500)
-    )
-    with closing(tictactoe.registry(tmp_path)) as registry:
+def test_what_is_declared_is_used(subtests: pytest.Subtests) -> None:
+    for entry_point, board in (
+        (CONNECT_FOUR, ((0, 1, 2, 3, 4, 5, 6),)),
+        (TICTACTOE, ((0, 3, 6), (1, 4, 7), (2, 5, 8))),
+        (SPREAD, None),
+        (f"{DECLARING}:Declaring", ((0, None), (1, 2))),
+    ):
+        assert environment_hooks(EnvironmentConfig(entry_point=entry_point)).declared.board == board
+    document = {"entry_point": f"{DECLARING}:Declaring", "wrappers": ["pad_action_space_v0"]}
+    wrapped = environment_hooks(EnvironmentConfig.model_validate(document))
+    assert (wrapped.draws, wrapped.has_views) == (True, True)
+    assert (wrapped.declared.agent_colors, wrapped.declared.board_area) == ({"player_1": "red"}, (0, 0, 1, 1))
+    assert environment_hooks(EnvironmentConfig(entry_point="policy_league.examples.kuhn_poker:env")).draws is False
+    config = EnvironmentConfig(entry_point=f"{DECLARING}:Malformed", kwargs={"board": [[3]]})
+    assert environment_hooks(config).declared.board == ((3,),), "that of the instance"
+    for declared, message in (
+        ({"board": [[0, 1], [2]]}, "board: .*rows of equal length"),
+        ({"board": []}, "board: .*rows of equal length"),
+        ({"board": [["a"]]}, r"board\[0\]\[0\]: .*integer"),
+        ({"board_area": [0, 0, 1]}, r"board_area\[3\]: .*required"),
+        ({"board_area": [0.5, 0, 0.5, 1]}, "board_area: .*left < right"),
+        ({"board_area": [0, 0, 640, 480]}, "board_area: .*between 0 and 1"),
+        ({"board_area": [float("nan"), 0, 1, 1]}, "board_area: .*between 0 and 1"),
+        ({"action_keys": {"w": "up"}}, "action_keys.w: .*integer"),
+        ({"agent_colors": {"player_1": "url(x)"}}, "agent_colors: .*player_1: 'url\\(x\\)' is neither"),
+    ):
+        config = EnvironmentConfig(entry_point=f"{DECLARING}:Malformed", kwargs=declared)
+        pattern = f"metadata of {DECLARING}:Malformed: {message}"
+        with subtests.test(declared=declared), pytest.raises(EnvironmentMismatch, match=pattern):
+            environment_hooks(config)
 
-        def offered(config: LeagueConfig) -> set[str]:
-            registry.leagues.register(config, interface(config))
-            found = playability(config, registry, interface(config), environment_hooks(config.environment))
-            return {ref for ref in found.opponents if not ref.startswith("script:")}
 
-        registry.leagues.register(before, interface(before))
-        for graph in (STRONG, WEAK):
-            tictactoe.publish(registry, graph)
-        registry.publisher.publish_mixture(tictactoe.LEAGUE, {1: 0.5, 2: 0.5})
-        registry.aliases.set(tictactoe.LEAGUE, "champion", 3, expected=None, actor="me", reason="test")
-        assert offered(before) == {"tictactoe@1", "tictactoe@2", "tictactoe@3"}
-        assert offered(now) == set()
+def test_cells_of_connect_four_are_around_its_holes() -> None:
+    """The holes are the white parts of the picture of an empty board."""
+    with closing(connect_four_v3.env(render_mode="rgb_array")) as env:
+        env.reset()
+        holes = env.render().min(axis=2) == 255
+    left, top, right, bottom = KNOWN["connect_four_v3"]["board_area"]
+    height, width = holes.shape
+    for centres, (low, high), cells in (
+        (centres_of(holes.any(axis=0)) / width, (left, right), 7),
+        (centres_of(holes.any(axis=1)) / height, (top, bottom), 6),
+    ):
+        assert centres == pytest.approx(low + (np.arange(cells) + 0.5) * (high - low) / cells, abs=0.002)
+
+
+def centres_of(inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The centres of the runs of True, in pixels."""
+    edges = np.flatnonzero(np.diff(np.pad(inside, 1).astype(int)))
+    return (edges[::2] + edges[1::2]) / 2

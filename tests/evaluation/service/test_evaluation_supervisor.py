@@ -1,25 +1,29 @@
-"""Evaluation processes: the ledger keeps their games if they or their service die."""
+"""Evaluation processes: where their matches are played, and that the ledger keeps them if they or their service die."""
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 import ray
 
 from evaluation.schedules.builders import round_robin
-from evaluation.service import evaluation_supervisor
-from evaluation.service.evaluation_supervisor import EvaluationSupervisor
+from evaluation.service import evaluation_job, evaluation_supervisor
+from evaluation.service.evaluation_supervisor import EvaluationJobOptions, EvaluationSupervisor
+from league.errors import InvalidInput
 from league.registry.registry import Registry
 from league.registry.storage.rows import EvaluationRow
+from league.results import ledger
 from league.results.ledger import Ledger
 from league.settings import Storage
 from league.subprocesses import Subprocess
 from tests.support.databases import StorageAt, on_both_databases
 from tests.support.leagues import tictactoe
+from tests.support.leagues.judged_league import reconfigure
 from tests.support.processes import running_module
 from tests.support.templates import copy_of
 from tests.support.waiting import until
@@ -58,25 +62,31 @@ def running(registry: Registry, **options: object) -> Iterator[EvaluationSupervi
         supervisor.close()
 
 
-def submit(registry: Registry, blocks: int) -> Callable[[], EvaluationRow]:
+def submit(registry: Registry, blocks: int, contestants: Sequence[str] = ()) -> Callable[[], EvaluationRow]:
     """Submit an evaluation; returns a function that reads its row."""
-    request = {"kind": "tournament", "schedule": "round_robin", "contestants": [], "blocks": blocks, "seed": 0}
+    request = {
+        "kind": "tournament",
+        "schedule": "round_robin",
+        "contestants": list(contestants),
+        "blocks": blocks,
+        "seed": 0,
+    }
     number = registry.evaluations.submit(tictactoe.LEAGUE, request, actor="test", max_active=8).id
     return lambda: registry.evaluations.get(tictactoe.LEAGUE, number)
 
 
 def change_environment(registry: Registry, environment: str) -> None:
     """Give the league another environment with the same spaces."""
-    config = tictactoe.config(environment={"entry_point": f"tests.support.environments.hanging:{environment}"})
-    registry.leagues.register(config, registry.leagues.get(tictactoe.LEAGUE).interface)
+    entry_point = f"tests.support.environments.hanging:{environment}"
+    reconfigure(registry, tictactoe.config(environment={"entry_point": entry_point}))
 
 
 def positions(registry: Registry, blocks: int) -> list[int]:
-    row = registry.leagues.get(tictactoe.LEAGUE)
-    schedule = round_robin(
-        row.config, row.interface, ["tictactoe@1", "tictactoe@2", "script:random", "script:one_ply"], blocks
+    row, refs = (
+        registry.leagues.get(tictactoe.LEAGUE),
+        ["tictactoe@1", "tictactoe@2", "script:random", "script:one_ply"],
     )
-    return sorted(Ledger(registry).positions(schedule.id))
+    return sorted(Ledger(registry).positions(round_robin(row.config, row.interface, refs, blocks).id))
 
 
 @pytest.mark.slow
@@ -107,10 +117,7 @@ def test_an_exception_of_the_environment_is_reported(registry: Registry) -> None
     evaluation = submit(registry, blocks=8)
     with running(registry):
         until(lambda: evaluation().ended_at is not None)
-    error = evaluation().error
-    assert evaluation().state == "failed"
-    assert error is not None
-    assert "the board is gone" in error["message"]
+    assert (evaluation().state, "the board is gone" in evaluation().error["message"]) == ("failed", True)
 
 
 SERVICE = """
@@ -125,9 +132,8 @@ sys.stdin.read()
 @pytest.mark.slow
 def test_an_evaluation_continues_after_its_service_was_killed(registry: Registry) -> None:
     evaluation = submit(registry, LONG)
-    with subprocess.Popen(
-        [sys.executable, "-c", SERVICE], cwd=Path(__file__).parents[3], stdin=subprocess.PIPE
-    ) as service:
+    command = [sys.executable, "-c", SERVICE]
+    with subprocess.Popen(command, cwd=Path(__file__).parents[3], stdin=subprocess.PIPE) as service:
         until(lambda: evaluation().progress is not None)
         (process,) = running_module("evaluation.service.evaluation_job", service.pid)
         service.kill()
@@ -146,7 +152,33 @@ def test_an_evaluation_whose_process_dies_repeatedly_fails(registry: Registry, m
     evaluation = submit(registry, blocks=8)
     with running(registry):
         until(lambda: evaluation().state == "failed")
-    error = evaluation().error
-    assert error is not None
-    assert error["code"] == "worker_lost"
+    assert evaluation().error["code"] == "worker_lost"
     assert registry.evaluations.claim("another", 1) is None
+
+
+def run(registry: Registry, workers: int) -> None:
+    """Claim the evaluation that waits, and run it in this process."""
+    number = registry.evaluations.claim("runner", workers).id
+    evaluation_job.run_evaluation(EvaluationJobOptions(number, tictactoe.LEAGUE, "runner", workers, None), registry)
+
+
+def test_one_worker_is_the_process_and_several_are_tasks(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    tasks: list[int] = []
+
+    def evaluate(*_: Any, workers: int, **__: Any) -> None:
+        tasks.append(workers)
+        raise InvalidInput("no match is played")
+
+    monkeypatch.setattr(evaluation_job, "evaluate", evaluate)
+    for workers in (1, 2, 3):
+        evaluation = submit(registry, blocks=1)
+        run(registry, workers)
+        assert evaluation().state == "failed"
+    assert tasks == [0, 2, 3]
+
+
+def test_an_evaluation_without_space_for_its_games_fails(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ledger, "MOST_BYTES", 2000)
+    evaluation = submit(registry, blocks=1000, contestants=("script:random", "script:one_ply"))
+    run(registry, 1)
+    assert (evaluation().state, evaluation().error["code"]) == ("failed", "out_of_space")

@@ -48,6 +48,8 @@ from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.waiting import until
 
 LONG = 240.0
+
+
 HASTY, GRACE = 1.0, 0.5
 """Seconds for a game that does not end, and until its process is killed."""
 
@@ -59,9 +61,8 @@ def registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
     tictactoe.publish(opened, tictactoe.graph(wins=True))
     evaluate(LEAGUE, ["tictactoe@1", "script:random"], registry=opened, blocks=1)
     for name in ("Hanging", "Raising", "Dying", "BlockingSignals"):
-        config = tictactoe.config(
-            league=name.lower(), environment={"entry_point": f"tests.support.environments.hanging:{name}"}
-        )
+        environment = {"entry_point": f"tests.support.environments.hanging:{name}"}
+        config = tictactoe.config(league=name.lower(), environment=environment)
         opened.leagues.register(config, interface(config))
     with pytest.MonkeyPatch.context() as patch:
         for name, value in opened.storage.environment.items():
@@ -116,22 +117,15 @@ def document_of(answer: GameResponse) -> dict[str, Any]:
 
 
 def test_playable_agents_are_listed(pool: GameWorkerPool) -> None:
+    agents = [
+        {"agent": name, "side": name, "actions": 9, "start": 0, "names": {}, "keys": {}, "color": color}
+        for name, color in (("player_1", "#6183e7"), ("player_2", "#f53a3a"))
+    ]
     assert document_of(submit(pool, PlayabilityRequest())) == {
         "league": LEAGUE,
         "playable": True,
         "why": None,
-        "agents": [
-            {
-                "agent": f"player_{i}",
-                "side": f"player_{i}",
-                "actions": 9,
-                "start": 0,
-                "names": {},
-                "keys": {},
-                "color": color,
-            }
-            for i, color in ((1, "#6183e7"), (2, "#f53a3a"))
-        ],
+        "agents": agents,
         "opponents": ["tictactoe@1", "script:random", "script:one_ply"],
         "draws": True,
         "board": [[0, 3, 6], [1, 4, 7], [2, 5, 8]],
@@ -140,9 +134,7 @@ def test_playable_agents_are_listed(pool: GameWorkerPool) -> None:
     }
 
 
-def test_a_pool_is_in_use_for_some_minutes_after_a_request(
-    pool: GameWorkerPool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pool_is_in_use_for_minutes_after_a_request(pool: GameWorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
     submit(pool, PlayabilityRequest())
     assert pool.is_in_use
     monkeypatch.setattr(game_worker_pool, "IDLE", 0.0)
@@ -180,12 +172,17 @@ def test_errors_keep_their_type(pool: GameWorkerPool) -> None:
             submit(pool, operation)
 
 
-def test_immutable_answers_are_cached(pool: GameWorkerPool) -> None:
-    assert submit(pool, play_request(4)) is submit(pool, play_request(4))
+def test_immutable_answers_are_cached_up_to_a_size(pool: GameWorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = submit(pool, play_request(1))
+    assert submit(pool, play_request(1)) is first
     assert submit(pool, PlayabilityRequest()) is not submit(pool, PlayabilityRequest())
+    monkeypatch.setattr(game_worker_pool, "CACHE_BYTES", len(first.content))
+    submit(pool, play_request(2))
+    submit(pool, play_request(3))
+    assert submit(pool, play_request(1)) is not first
 
 
-def test_a_slow_request_can_be_repeated(
+def test_slow_requests_are_repeated(
     pool: GameWorkerPool, pause: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def submit_twice() -> GameResponse:
@@ -200,15 +197,15 @@ def test_a_slow_request_can_be_repeated(
 
 
 def test_a_hanging_game_is_aborted_and_others_are_played(pool: GameWorkerPool) -> None:
+    request = game_request(play_request(0, opponent="script:random"), "hanging")
+
     async def both() -> None:
-        hung = asyncio.create_task(
-            pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), LONG)
-        )
+        hung = asyncio.create_task(pool.submit(request, LONG))
         await pool.submit(game_request(play_request(0)), LONG)
         with pytest.raises(GameHung, match=f"a game of hanging did not end within {HASTY:g} s"):
             await hung
         with pytest.raises(NotReady):  # the hang is not cached
-            await pool.submit(game_request(play_request(0, opponent="script:random"), "hanging"), 0.0)
+            await pool.submit(request, 0.0)
 
     asyncio.run(both())
 
@@ -284,9 +281,7 @@ def test_idle_leagues_are_evicted_but_not_during_a_game(registry: Registry) -> N
         assert not Path(f"/proc/{asyncio.run(submit_several())}").exists()
 
 
-def test_the_number_of_waiting_requests_is_limited(
-    pool: GameWorkerPool, pause: threading.Event, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_requests_may_wait(pool: GameWorkerPool, pause: threading.Event, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(game_worker_pool, "MOST_WAITING", 2)
 
     async def submit_many() -> None:
@@ -301,23 +296,10 @@ def test_the_number_of_waiting_requests_is_limited(
     asyncio.run(submit_many())
 
 
-def test_the_size_of_the_cache_is_limited(pool: GameWorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = submit(pool, play_request(1))
-    monkeypatch.setattr(game_worker_pool, "CACHE_BYTES", len(first.content))
-    submit(pool, play_request(2))
-    submit(pool, play_request(3))
-    assert submit(pool, play_request(1)) is not first
-
-
 def test_only_leagues_with_discrete_actions_are_playable(registry: Registry, pool: GameWorkerPool) -> None:
-    config = tictactoe.config(
-        league="spread",
-        environment={
-            "entry_point": "mpe2.simple_spread_v3",
-            "kwargs": {"max_cycles": 4, "continuous_actions": True},
-        },
-        play={"opening_plies": 0},
-    )
+    kwargs = {"max_cycles": 4, "continuous_actions": True}
+    environment = {"entry_point": "mpe2.simple_spread_v3", "kwargs": kwargs}
+    config = tictactoe.config(league="spread", environment=environment, play={"opening_plies": 0})
     registry.leagues.register(config, interface(config))
     document = document_of(submit(pool, PlayabilityRequest(), "spread"))
     assert (document["playable"], document["agents"]) == (False, [])

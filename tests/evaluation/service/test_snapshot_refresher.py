@@ -113,9 +113,7 @@ def test_refreshing_resumes_when_the_database_is_back(registry: Registry, caplog
 
 @pytest.mark.usefixtures("ray_session")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_an_evaluation_service_works_until_snapshots_are_current(
-    registry: Registry, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_service_works_until_snapshots_are_current(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deployment, "POLL", 0.05)
     service = EvaluationService(workers=1, at_once=1)
     play(registry, seed=1)

@@ -1,14 +1,16 @@
-"""Snapshots are what the ledger contains, and are recomputed only after changes."""
+"""Snapshots are what the ledger contains, also of earlier games, and are recomputed only after changes."""
 
 import logging
-import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from evaluation.gating import evidence
 from evaluation.gating.evidence import verdict_of
@@ -17,17 +19,20 @@ from evaluation.matches.game_records import unique_games
 from evaluation.matches.leaderboard import MAX_UPSETS, compute_leaderboard
 from evaluation.matches.tournament import evaluate
 from evaluation.service import snapshots
-from evaluation.service.snapshots import documents, refresh, thinned
+from evaluation.service.snapshots import EarlierResults, documents, earlier_results, refresh, thinned
 from evaluation.statistics.payoff import tabulate
+from league.conditions import GameChange
 from league.environments.building import interface
 from league.errors import AlreadyRunning, UnknownLeague
 from league.registry.registry import Registry
+from league.registry.snapshots import earlier_part
 from league.registry.storage.rows import SnapshotRow
 from league.results.ledger import Ledger
 from league.results.sums import tally
-from league.settings import Storage
 from tests.support.leagues import reported_league, tictactoe
+from tests.support.leagues.judged_league import reconfigure
 from tests.support.leagues.tictactoe import LEAGUE
+from tests.support.templates import copied
 
 PARTS = {"summary", "leaderboard", "payoff", "ratings"}
 
@@ -44,9 +49,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def registry(home: Path, tmp_path: Path) -> Iterator[Registry]:
     """A copy of the league that a test may change."""
-    opened = Registry.open(Storage.at(Path(shutil.copytree(home, tmp_path / "home"))))
-    yield opened
-    opened.close()
+    with copied(home, tmp_path / "home") as opened:
+        yield opened
 
 
 def snapshot(registry: Registry, part: str) -> SnapshotRow:
@@ -111,7 +115,6 @@ def test_each_verdict_has_its_evidence(registry: Registry) -> None:
     assert registry.snapshots.marks(LEAGUE).keys() == PARTS | {f"verdict/{row.id}" for row in rows}
     for row in rows:
         evidence = verdict_of(registry, row).to_json()
-        assert row.evidence is not None
         assert (evidence["outcome"], evidence["promoted"]) == (row.outcome, row.evidence["promoted"])
         assert (evidence["llr"], evidence["blocks"]) == (row.evidence["llr"], row.evidence["blocks"])
         assert evidence["counts"] == row.evidence["counts"]
@@ -122,18 +125,14 @@ def test_each_verdict_has_its_evidence(registry: Registry) -> None:
     assert reasons[-1].startswith("Stronger: ")
 
 
-def test_a_rollback_changes_why_the_best_version_is_not_champion(registry: Registry) -> None:
-    assert snapshot(registry, "leaderboard").document["not_champion"] is None
-    registry.aliases.rollback(LEAGUE, actor="ada", reason="it was slow")
-    refresh(registry, LEAGUE)
-    assert "it was rolled back" in snapshot(registry, "leaderboard").document["not_champion"]
-
-
-def test_current_snapshots_are_not_recomputed(registry: Registry) -> None:
+def test_current_snapshots_are_recomputed_after_a_rollback(registry: Registry) -> None:
     times_before = times(registry)
     assert registry.snapshots.stale() == []
     refresh(registry, LEAGUE)
     assert times(registry) == times_before
+    registry.aliases.rollback(LEAGUE, actor="ada", reason="it was slow")
+    refresh(registry, LEAGUE)
+    assert "it was rolled back" in snapshot(registry, "leaderboard").document["not_champion"]
 
 
 def test_new_games_change_the_standings_but_not_closed_verdicts(registry: Registry) -> None:
@@ -149,45 +148,19 @@ def test_new_games_change_the_standings_but_not_closed_verdicts(registry: Regist
 
 def test_a_verdict_is_recomputed_until_it_is_closed_and_when_voided(registry: Registry) -> None:
     verdict = open_verdict(registry, registry.leagues.get(LEAGUE), 1, "tictactoe@3", alpha=0.001)
-    part = f"verdict/{verdict.id}"
-    refresh(registry, LEAGUE)
-    opened = snapshot(registry, part)
-    assert (opened.document["outcome"], opened.document["curve"]) == ("open", [])
+
+    def refreshed() -> dict[str, Any]:
+        refresh(registry, LEAGUE)
+        return snapshot(registry, f"verdict/{verdict.id}").document
+
+    opened = refreshed()
+    assert (opened["outcome"], opened["curve"]) == ("open", [])
     registry.verdicts.close(verdict.id, "inconclusive", {"note": "nobody has played"})
-    refresh(registry, LEAGUE)
-    closed = snapshot(registry, part)
-    assert (closed.document["outcome"], closed.document["reason"]) == (
-        "inconclusive",
-        "Inconclusive: nobody has played.",
-    )
+    closed = refreshed()
+    assert (closed["outcome"], closed["reason"]) == ("inconclusive", "Inconclusive: nobody has played.")
     void(registry, verdict.id, actor="ada", reason="a mistake")
-    refresh(registry, LEAGUE)
-    voided = snapshot(registry, part).document
+    voided = refreshed()
     assert (voided["outcome"], voided["reason"]) == ("void", "Void: voided by ada: a mistake.")
-
-
-def test_purged_games_are_ignored(registry: Registry) -> None:
-    verdict = registry.verdicts.all(LEAGUE)[0]
-    ledger = Ledger(registry)
-    matches = [match for schedule in verdict.schedules for match in ledger.matches(league=LEAGUE, schedule=schedule)]
-    games = snapshot(registry, "summary").document["games"]
-    void(registry, verdict.id, actor="ada", reason="another machine's", purge=True)
-    refresh(registry, LEAGUE)
-    summary = snapshot(registry, "summary").document
-    assert summary["games"] == games - sum(len(match.games) for match in matches) < games
-    assert snapshot(registry, f"verdict/{verdict.id}").document["outcome"] == "void"
-
-
-def test_games_of_another_environment_are_ignored(registry: Registry) -> None:
-    changed = tictactoe.config(environment={"entry_point": "tests.support.environments.hanging:Raising"})
-    registry.leagues.register(changed, registry.leagues.get(LEAGUE).interface)
-    assert registry.snapshots.stale() == [LEAGUE]
-    refresh(registry, LEAGUE)
-    summary = snapshot(registry, "summary").document
-    assert (summary["games"], summary["environment"]) == (0, "tests.support.environments.hanging:Raising")
-    assert snapshot(registry, "leaderboard").document["leaderboard"] == []
-    assert snapshot(registry, "payoff").document is None
-    assert [version["rating"] for version in snapshot(registry, "ratings").document["versions"]] == [None] * 3
 
 
 def test_a_league_without_matches_has_all_parts(tmp_path: Path) -> None:
@@ -219,39 +192,33 @@ def test_the_longest_waiting_leagues_are_refreshed_first(registry: Registry) -> 
     assert registry.snapshots.stale() == ["never", "long-ago", LEAGUE]
 
 
-def test_a_league_is_refreshed_by_one_process_at_a_time(registry: Registry) -> None:
-    other = Registry.open(registry.storage)
-    with other.exclusive_lock(f"snapshots-{LEAGUE}"), pytest.raises(AlreadyRunning):
-        refresh(registry, LEAGUE)
-    other.close()
-
-
-def test_an_aborted_refresh_keeps_the_previous_snapshots(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refresh_is_exclusive_and_changes_all_or_nothing(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(Registry.open(registry.storage)) as other, other.exclusive_lock(f"snapshots-{LEAGUE}"):  # noqa: SIM117
+        with pytest.raises(AlreadyRunning):
+            refresh(registry, LEAGUE)
     previous = {part: snapshot(registry, part) for part in registry.snapshots.marks(LEAGUE)}
     registry.aliases.rollback(LEAGUE, actor="ada", reason="test")
 
     def abort(*_: object) -> Any:
         raise SystemExit("power cut")
 
-    monkeypatch.setattr(snapshots, "rated_version", abort)
-    with pytest.raises(SystemExit):
-        refresh(registry, LEAGUE)
+    with monkeypatch.context() as patched:
+        patched.setattr(snapshots, "rated_version", abort)
+        with pytest.raises(SystemExit):
+            refresh(registry, LEAGUE)
     assert {part: snapshot(registry, part) for part in registry.snapshots.marks(LEAGUE)} == previous
     assert registry.snapshots.stale() == [LEAGUE]
-    monkeypatch.undo()
     refresh(registry, LEAGUE)
     assert registry.snapshots.stale() == []
 
 
 def test_a_failing_verdict_does_not_affect_the_others(
-    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     with reported_league.empty(tmp_path) as registry:
         tictactoe.publish(registry, tictactoe.graph())
-        first, second = (
-            open_verdict(registry, registry.leagues.get(LEAGUE), 1, "script:random"),
-            open_verdict(registry, registry.leagues.get(LEAGUE), 1, "script:one_ply"),
-        )
+        row = registry.leagues.get(LEAGUE)
+        first, second = (open_verdict(registry, row, 1, f"script:{name}") for name in ("random", "one_ply"))
 
         def fail_for_second(registry: Registry, verdict: Any) -> Any:
             if verdict.id == second.id:
@@ -265,12 +232,75 @@ def test_a_failing_verdict_does_not_affect_the_others(
     assert f"verdict {second.id} has no snapshot" in caplog.text
 
 
-@pytest.mark.parametrize("blocks", [0, 1, 7, 8, 9, 10, 1000])
-def test_a_curve_is_thinned_to_a_limited_number_of_points(blocks: int) -> None:
-    curve = [block / 2 for block in range(1, blocks + 1)]
-    points = thinned(curve, most=8)
-    assert len(points) == min(blocks, 8)
+@given(st.integers(0, 1000), st.integers(2, 20))
+def test_a_curve_is_thinned_to_a_limited_number_of_points(blocks: int, most: int) -> None:
+    points = thinned([block / 2 for block in range(1, blocks + 1)], most=most)
+    assert len(points) == min(blocks, most)
     assert all(llr == block / 2 for block, llr in points)
     assert [block for block, _ in points] == sorted({block for block, _ in points})
     if blocks:
         assert (points[0][0], points[-1][0]) == (1, blocks)
+
+
+OLD = {"opening_plies": 2, "num_envs": 4}
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Iterator[Registry]:
+    """A league with four matches."""
+    with closing(tictactoe.registry(tmp_path / "small", play=OLD)) as opened:
+        tictactoe.publish(opened, tictactoe.graph(wins=True))
+        evaluate(LEAGUE, registry=opened, schedule="gauntlet", against=["script:random"], blocks=4)
+        yield opened
+
+
+def change(registry: Registry, **play: object) -> None:
+    reconfigure(registry, tictactoe.config(play=OLD | play))
+
+
+def earlier(registry: Registry) -> list[EarlierResults]:
+    return earlier_results(registry, registry.leagues.get(LEAGUE))
+
+
+def test_tables_before_and_after_a_change_are_kept_apart(small: Registry) -> None:
+    refresh(small, LEAGUE)
+    before, payoff = snapshot(small, "leaderboard"), snapshot(small, "payoff")
+    change(small, opening_plies=4)
+    assert small.snapshots.stale() == [LEAGUE]
+    refresh(small, LEAGUE)
+    assert snapshot(small, "payoff").document is None
+    assert [version["rating"] for version in snapshot(small, "ratings").document["versions"]] == [None]
+    (results,) = earlier(small)
+    assert results.changes == (GameChange("play.opening_plies", "2", "4"),)
+    assert (results.matches, results.actions_changed, results.replaced_at is None) == (4, False, False)
+    summary, current = snapshot(small, "summary"), snapshot(small, "leaderboard")
+    assert summary.document["earlier"] == [results.to_json()]
+    assert (summary.document["matches"], current.document["leaderboard"]) == (0, [])
+    assert "there is no champion: it has not been tested" in before.document["not_champion"]
+    leaderboard = before.document | {"not_champion": None}  # the champion is that of the current game
+    for part, document in (("leaderboard", leaderboard), ("payoff", payoff.document)):
+        assert snapshot(small, earlier_part(results.conditions.name, part)).document == document
+
+
+def test_only_results_of_another_game_or_selection_of_actions_are_earlier_ones(small: Registry) -> None:
+    change(small, num_envs=2)
+    assert earlier(small) == []
+    change(small, opening_plies=4)
+    change(small)
+    assert earlier(small) == [], "a game that returns counts again"
+    assert [game.game["play.opening_plies"] for game in small.leagues.earlier_games(LEAGUE)] == [4]
+    change(small, actions="sampled")
+    (results,) = earlier(small)
+    assert (results.conditions.actions, results.actions_changed, results.changes) == ("greedy", True, ())
+
+
+def test_a_game_without_results_is_recorded(small: Registry) -> None:
+    """A worker that has the configuration from before a change records its matches afterwards."""
+    change(small, opening_plies=3)
+    change(small, opening_plies=4)
+    evaluate(LEAGUE, registry=small, schedule="gauntlet", against=["script:random"], blocks=2)
+    change(small, opening_plies=5)
+    assert {results.matches: results.changes for results in earlier(small)} == {
+        4: (GameChange("play.opening_plies", "2", "5"),),
+        2: (GameChange("play.opening_plies", "4", "5"),),
+    }

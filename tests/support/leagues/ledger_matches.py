@@ -1,10 +1,6 @@
 """Matches for the ledger."""
 
-from league.results.records import (
-    Game,
-    Match,
-    Schedule,
-)
+from league.results.records import Game, Match, Schedule
 from tests.support.leagues.registries import LEAGUE, config
 
 SCHEDULE = Schedule(

@@ -139,6 +139,10 @@ def snapshots() -> dict[str, Any]:
     judgement = evidence(True) | {"verdict": WON, "candidate": "board@2", "opponent": "board@1", "outcome": "promote"}
     judgement |= {"reason": "It is the stronger one.", "curve": curve, "counts": [2, 3, 9, 12, 15], "anchors": []}
     stale = judgement | {"verdict": LOST, "outcome": "open", "reason": "It is not decided yet."}
+    pair, change = {"better": "board@1", "other": "board@2"}, {"name": "play.opening_plies", "before": "4", "now": "2"}
+    earlier = {"name": EARLIER, "actions": "greedy", "matches": 3, "changes": [change]}
+    alpha_rank = {"alpha_rank": 0.9, "alpha_rank_interval": [0.5, 1.0]}
+    nash = {"nash": 1.0, "nash_interval": [0.7, 1.0]}
     return {
         "summary": {
             "games": 12,
@@ -149,29 +153,11 @@ def snapshots() -> dict[str, Any]:
             "sides": ["player_0", "player_1"],
             "environment": "games.none:none",
             "environment_digest": "0" * 64,
-            "upsets": [
-                {
-                    "match": f"{SCHEDULE.id}/1",
-                    "game": 0,
-                    "better": "board@1",
-                    "other": "board@2",
-                    "expected": 0.1,
-                    "score": 1,
-                }
-            ],
-            "earlier": [
-                {
-                    "name": EARLIER,
-                    "actions": "greedy",
-                    "matches": 3,
-                    "changes": [{"name": "play.opening_plies", "before": "4", "now": "2"}],
-                    "actions_changed": False,
-                    "replaced_at": "2026-03-02T14:00:00Z",
-                }
-            ],
+            "upsets": [{"match": f"{SCHEDULE.id}/1", "game": 0, "expected": 0.1, "score": 1} | pair],
+            "earlier": [earlier | {"actions_changed": False, "replaced_at": "2026-03-02T14:00:00Z"}],
         },
         "leaderboard": {
-            "sides": ["player_0", "player_1"],
+            "sides": list(SCHEDULE.sides),
             "leaderboard": leaderboard,
             "by_side": {"player_0": leaderboard[:2], "player_1": []},
         },
@@ -181,16 +167,7 @@ def snapshots() -> dict[str, Any]:
             "games": [[0, 4], [4, 0]],
             "by_side": {},
             "difference": [[None, {"mean": 0.5, "low": None, "high": None}], [None, None]],
-            "shares": [
-                {
-                    "ref": "board@2",
-                    "alpha_rank": 0.9,
-                    "alpha_rank_interval": [0.5, 1.0],
-                    "nash": 1.0,
-                    "nash_interval": [0.7, 1.0],
-                    "value": 0.0,
-                }
-            ],
+            "shares": [{"ref": "board@2", "value": 0.0} | alpha_rank | nash],
         },
         f"earlier/{EARLIER}/leaderboard": {"sides": [], "leaderboard": leaderboard[1:2], "by_side": {}},
         f"earlier/{EARLIER}/payoff": None,
