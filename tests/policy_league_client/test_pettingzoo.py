@@ -12,40 +12,29 @@ from pettingzoo import ParallelEnv
 from pettingzoo.classic import rps_v2, tictactoe_v3
 
 from league.errors import InvalidInput, UnknownLeague
-from league.interface import AgentInterface
 from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Policy
 from league.registry.registry import Registry
 from league.settings import Storage
-from league.spaces import Box as BoxSpace
-from league.spaces import DictSpace
-from league.spaces import Discrete as DiscreteSpace
 from policy_league_client import Client
 from policy_league_client.pettingzoo import Step, play
+from tests.support.leagues import tictactoe
 from tests.support.leagues.protocol_leagues import CHOICE, table
 from tests.support.leagues.served_leagues import everything, promote, publish, register
 from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.streaming import Listening, listening
 from tests.support.waiting import until
 
-TICTACTOE = AgentInterface(
-    observation=DictSpace(
-        spaces={
-            "observation": BoxSpace(dtype="int8", shape=(3, 3, 2), low=0, high=1),
-            "action_mask": BoxSpace(dtype="int8", shape=(9,), low=0, high=1),
-        }
-    ),
-    action=DiscreteSpace(n=9),
-)
 BOTH = {"player_1": "tictactoe", "player_2": "tictactoe@2"}
 
 
 @pytest.fixture(scope="module")
 def registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
-    registry = everything(Storage.at(tmp_path_factory.mktemp("played")))
-    register(registry, "tictactoe", {"shared": TICTACTOE})
+    home = tmp_path_factory.mktemp("played")
+    everything(Storage.at(home)).close()
+    registry = tictactoe.registry(home)
     for seed in range(2):
-        publish(registry, "tictactoe", {"shared": masked_mlp((3, 3, 2), 9, seed=seed)}, f"run/{seed}")
+        tictactoe.publish(registry, masked_mlp((3, 3, 2), 9, seed=seed))
     register(registry, "rps", {"shared": CHOICE})
     publish(registry, "rps", {"shared": table()}, "run")
     for league in ("tictactoe", "rps"):
@@ -86,12 +75,12 @@ def test_an_aec_environment_is_played_to_the_end(client: Client) -> None:
     steps = list(play(tictactoe_v3.env(), client, BOTH, seed=3))
     moves = play_locally(policies)
     by_agent = {agent: [step for step in steps if step.agent == agent] for agent in policies}
-    for agent, own in by_agent.items():
-        assert [step.action for step in own] == [action for mover, action in moves if mover == agent]
-        assert [step.terminated for step in own] == [False] * (len(own) - 1) + [True]
-        for step, following in pairwise(own):
+    for agent, turns in by_agent.items():
+        assert [step.action for step in turns] == [action for mover, action in moves if mover == agent]
+        assert [step.terminated for step in turns] == [False] * (len(turns) - 1) + [True]
+        for step, following in pairwise(turns):
             np.testing.assert_array_equal(step.next_observation["observation"], following.observation["observation"])
-        assert {step.response.version for step in own if step.response} == {1 if agent == "player_1" else 2}
+        assert {step.response.version for step in turns if step.response} == {1 if agent == "player_1" else 2}
     assert sum(step.reward for step in steps) == 0
     assert {step.observation["action_mask"][step.action] for step in steps} == {1}
 
@@ -151,14 +140,9 @@ class Constant(ParallelEnv):
         self._observation[:] = 1 if self._time < 5 else 7
         over = {agent: self._time == self.lengths[agent] for agent in acted}
         self.agents = [agent for agent in acted if not over[agent]]
-        nothing = dict.fromkeys(acted, False)
-        return (
-            dict.fromkeys(acted, self._observation),
-            {a: float(actions[a]) for a in acted},
-            nothing,
-            over,
-            {a: {} for a in acted},
-        )
+        rewards = {agent: float(actions[agent]) for agent in acted}
+        observations, terminated = dict.fromkeys(acted, self._observation), dict.fromkeys(acted, False)
+        return observations, rewards, terminated, over, {agent: {} for agent in acted}
 
 
 def test_each_agent_has_its_own_recurrent_state(client: Client) -> None:
@@ -175,18 +159,15 @@ def test_each_agent_has_its_own_recurrent_state(client: Client) -> None:
 
 
 def test_a_promotion_during_an_episode_changes_no_player(client: Client, registry: Registry) -> None:
-    steps = []
+    game = play(tictactoe_v3.env(), client, {"player_1": "tictactoe", "player_2": "tictactoe"}, seed=3)
+    first = deepcopy(next(game))
     try:
-        for step in play(tictactoe_v3.env(), client, {"player_1": "tictactoe", "player_2": "tictactoe"}, seed=3):
-            if not steps:
-                promote(registry, "tictactoe", 2)
-                seen = deepcopy(step.observation)
-                until(lambda seen=seen: client.act("tictactoe", seen).version == 2)
-            steps.append(step)
+        promote(registry, "tictactoe", 2)
+        until(lambda: client.act("tictactoe", first.observation).version == 2)
+        assert {step.response.version for step in (first, *game) if step.response} == {1}
     finally:
         promote(registry, "tictactoe", 1)
         registry.changes.wait_for_alias(registry.aliases.history("tictactoe")[0], 240)
-    assert {step.response.version for step in steps if step.response} == {1}
 
 
 def test_each_agent_needs_a_player(client: Client) -> None:

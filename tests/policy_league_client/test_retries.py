@@ -1,5 +1,6 @@
-"""Which requests are retried, and that a retry repeats the request exactly."""
+"""Requests to a server that fails: which are retried, how a retry repeats them, and which errors are raised."""
 
+import itertools
 import json
 import threading
 from collections.abc import Iterator
@@ -9,24 +10,15 @@ from typing import Any
 import httpx
 import pytest
 
-from league.errors import DeadlineExceeded, NotReady, Overloaded, RateLimited, RemoteError
+from league import errors
 from policy_league_client import retries
 from policy_league_client.retries import Retries
 from tests.support.clients.sync_and_async import Connect
 
 DROP, NO_RESPONSE = 0, 1
 """In place of a status: close the connection without a response, or do not respond."""
-MOVED = {
-    "league": "board",
-    "alias": "champion",
-    "kind": "promotion",
-    "version": 2,
-    "previous": 1,
-    "actor": "player",
-    "reason": "",
-    "at": "2026-11-21T00:00:00+00:00",
-    "event": 3,
-}
+MOVED = {"league": "board", "alias": "champion", "kind": "promotion", "version": 2, "previous": 1, "event": 3}
+MOVED |= {"actor": "player", "reason": "", "at": "2026-11-21T00:00:00+00:00"}
 ACTED = {"action": 4, "model": "board", "version": 1, "sha256": "0"}
 
 
@@ -34,8 +26,10 @@ class Server:
     """Returns the prepared responses in order, then the last one repeatedly."""
 
     def __init__(self) -> None:
-        self.answers: list[tuple[int, dict[str, Any], dict[str, str]]] = []
+        self.answers: list[tuple[int, Any, dict[str, str]]] = []
         self.requests: list[tuple[bytes, dict[str, str]]] = []
+        self.paths: list[str] = []
+        self.connections = set[tuple[str, int]]()
         self.is_over = threading.Event()
 
     def prepare(self, *statuses: int, then: dict[str, Any], **headers: str) -> None:
@@ -51,6 +45,8 @@ class Server:
             protocol_version = "HTTP/1.1"
 
             def do_POST(self) -> None:
+                server.connections.add(self.client_address)
+                server.paths.append(self.path)
                 body = self.rfile.read(int(self.headers["content-length"]))
                 server.requests.append((body, {name.lower(): value for name, value in self.headers.items()}))
                 status, document, headers = server.answers.pop(0) if len(server.answers) > 1 else server.answers[0]
@@ -59,7 +55,7 @@ class Server:
                 if status in (DROP, NO_RESPONSE):
                     self.close_connection = True
                     return
-                answer = json.dumps(document).encode()
+                answer = document if isinstance(document, bytes) else json.dumps(document).encode()
                 self.send_response(status)
                 for name, value in {"content-length": str(len(answer)), **headers}.items():
                     self.send_header(name, value)
@@ -114,23 +110,26 @@ def test_a_retry_repeats_the_seed(connect: Connect, server: Server) -> None:
     assert [json.loads(body)["seed"] for body in bodies] == [answer.seed]
 
 
-@pytest.mark.parametrize(
-    ("status", "expected"), [(429, Overloaded), (503, NotReady), (504, DeadlineExceeded), (DROP, RemoteError)]
-)
-def test_a_retry_deadline_of_zero_disables_retries(
-    connect: Connect, server: Server, status: int, expected: type[Exception]
-) -> None:
-    server.prepare(status, then=ACTED)
-    with pytest.raises(expected):
-        connect(server.url, retry_deadline=0).act("board", [1])
-    assert len(server.requests) == 1
+def test_a_retry_deadline_of_zero_disables_retries(connect: Connect, server: Server) -> None:
+    failures = (
+        (429, errors.Overloaded),
+        (503, errors.NotReady),
+        (504, errors.DeadlineExceeded),
+        (DROP, errors.RemoteError),
+    )
+    for number, (status, expected) in enumerate(failures, 1):
+        server.prepare(status, then=ACTED)
+        with pytest.raises(expected):
+            connect(server.url, retry_deadline=0).act("board", [1])
+        assert len(server.requests) == number
 
 
 def test_retry_after_beyond_the_deadline_ends_the_retries(connect: Connect, server: Server) -> None:
     server.prepare(429, then=ACTED, retry_after="60")
-    with pytest.raises(Overloaded):
+    server.answers[0][1].update(code="rate_limited")
+    with pytest.raises(errors.RateLimited) as raised:
         connect(server.url, retry_deadline=30).act("board", [1])
-    assert len(server.requests) == 1, "Retry-After exceeds the deadline"
+    assert (raised.value.wait, len(server.requests)) == (60, 1)
 
 
 def test_the_timeout_applies_to_each_attempt(connect: Connect, server: Server) -> None:
@@ -145,41 +144,24 @@ def reply(status: int, code: str | None = "x", **headers: str) -> httpx.Response
     return httpx.Response(status, headers=named, json=document if code else None)
 
 
-@pytest.mark.parametrize(
-    ("outcome", "is_repeated"),
-    [
-        (httpx.ConnectError("refused"), True),
-        (httpx.ReadTimeout("late"), True),
-        (httpx.RemoteProtocolError("hung up"), True),
-        (reply(429), True),
-        (reply(502), True),
-        (reply(503), True),
-        (reply(504), True),
-        (reply(500, None), True),
-        (reply(404, None), True),
-        (reply(200), False),
-        (reply(400), False),
-        (reply(401), False),
-        (reply(404), False),
-        (reply(409), False),
-        (reply(410), False),
-        (reply(413), False),
-        (reply(500), False),
-        (reply(403, None), False),
-    ],
-    ids=str,
-)
-def test_which_outcomes_are_retried(outcome: Any, is_repeated: bool) -> None:
-    assert (Retries(10).next_delay(outcome) is not None) == is_repeated
-    assert Retries(0).next_delay(outcome) is None
-
-
-def test_a_request_waits_longer_for_a_replica_than_for_a_version(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_which_outcomes_are_retried(monkeypatch: pytest.MonkeyPatch, subtests: pytest.Subtests) -> None:
+    lost = (httpx.ConnectError("refused"), httpx.ReadTimeout("late"), httpx.RemoteProtocolError("hung up"))
+    not_ours = [reply(status, None) for status in (404, 500)]
+    repeated = (*lost, *(reply(status) for status in (429, 502, 503, 504)), *not_ours)
+    final = (*(reply(status) for status in (200, 400, 401, 404, 409, 410, 413, 500)), reply(403, None))
+    for outcome in (*repeated, *final):
+        with subtests.test(outcome=outcome):
+            assert (Retries(10).next_delay(outcome) is not None) == (outcome in repeated)
+            assert Retries(0).next_delay(outcome) is None
+    assert (Retries(10).next_delay(reply(429, retry_after="3")) or 0) >= 3
+    assert Retries(2).next_delay(reply(429, retry_after="3")) is None
+    for invalid in ("soon", "-1", "1.5", ""):
+        assert (Retries(10).next_delay(reply(429, retry_after=invalid)) or 9) < 1
     monkeypatch.setattr(retries, "NOT_READY_DEADLINE", 1.0)
     monkeypatch.setattr(retries, "INITIAL_DELAY", 2.0)
     monkeypatch.setattr(retries, "JITTER", 0.0)
     assert Retries(10).next_delay(reply(503, "not_ready")) is None
-    assert Retries(10).next_delay(reply(503, "no_replica")) is not None
+    assert Retries(10).next_delay(reply(503, "no_replica")) is not None, "it waits longer for a replica"
 
 
 def test_delays_grow_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,16 +174,47 @@ def test_delays_grow_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(set(delays)) == 12, "delays have jitter"
 
 
-def test_retry_after_is_a_lower_bound() -> None:
-    assert (Retries(10).next_delay(reply(429, retry_after="3")) or 0) >= 3
-    assert Retries(2).next_delay(reply(429, retry_after="3")) is None
-    for invalid in ("soon", "-1", "1.5", ""):
-        assert (Retries(10).next_delay(reply(429, retry_after=invalid)) or 9) < 1
+def error(status: int, code: str, message: str = "a sentence") -> tuple[int, Any]:
+    return status, {"code": code, "message": message}
 
 
-def test_the_wait_of_a_rate_limit_is_reported(connect: Connect, server: Server) -> None:
-    server.prepare(429, then=ACTED, retry_after="7")
-    server.answers[0][1].update(code="rate_limited")
-    with pytest.raises(RateLimited) as raised:
-        connect(server.url, retry_deadline=1).act("board", [1])
-    assert raised.value.wait == 7
+def test_connections_are_reused(connect: Connect, server: Server) -> None:
+    server.prepare(then=ACTED)
+    client = connect(server.url)
+    for _ in range(5):
+        client.act("board.left@7", [1])
+    assert len(server.connections) == 1
+    assert set(server.paths) == {"/v1/policies/board.left/action?version=7"}
+
+
+FAILURES: tuple[tuple[tuple[int, Any], type[Exception], bool], ...] = (
+    (error(404, "unknown_league", "there is no league 'board'; known: none yet"), errors.UnknownLeague, False),
+    (error(400, "invalid_observation"), errors.ObservationError, False),
+    (error(413, "body_too_large"), errors.BodyTooLarge, False),
+    (error(503, "not_ready"), errors.NotReady, True),
+    (error(500, "internal_error"), errors.RemoteError, False),
+    ((200, b"<html>"), errors.RemoteError, False),
+    ((404, b"HAProxy knows of no replica yet"), errors.RemoteError, True),
+    ((429, b"dropped due to backpressure"), errors.RemoteError, True),
+    ((500, b"Internal Server Error"), errors.RemoteError, True),
+    ((DROP, b""), errors.RemoteError, True),
+)
+
+
+def test_errors_are_raised_unless_they_are_temporary(
+    connect: Connect, server: Server, monkeypatch: pytest.MonkeyPatch, subtests: pytest.Subtests
+) -> None:
+    monkeypatch.setattr(retries, "monotonic", itertools.count().__next__)  # a second between two attempts
+    for failure, expected, is_temporary in FAILURES:
+        with subtests.test(failure=failure):
+            server.requests, server.answers = [], [(*failure, {})]
+            with pytest.raises(expected) as raised:
+                connect(server.url, retry_deadline=2.5).act("board", [1])
+            assert type(raised.value) is expected
+            assert len(server.requests) == (3 if is_temporary else 1)
+            if expected is errors.UnknownLeague:
+                assert str(raised.value).endswith("known: none yet"), "the message is the server's"
+            if is_temporary:
+                server.requests, server.answers = [], [(*failure, {})] * 5 + [(200, ACTED, {})]
+                assert connect(server.url).act("board", [1]).action == 4
+                assert len(server.requests) == 6

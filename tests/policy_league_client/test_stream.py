@@ -1,26 +1,18 @@
-"""The client's streams: actions equal those of calls, and a lost connection continues on another replica."""
+"""The client's streams and episodes keep their version, and continue on another replica or report that it is gone."""
 
 import asyncio
 import json
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
-from websockets.sync.server import Server, ServerConnection, serve
+from websockets.sync.server import ServerConnection, serve
 
-from league.errors import (
-    BodyTooLarge,
-    InvalidInput,
-    InvalidState,
-    NotReady,
-    ObservationError,
-    RemoteError,
-    UnknownLeague,
-    VersionRetired,
-)
+from league import errors
 from league.registry.registry import Registry
 from policy_league_client import AsyncClient
 from serve_app.runtime.haproxy import free_ports
@@ -53,66 +45,39 @@ def test_a_stream_returns_the_actions_of_calls(connect: Connect, url: str) -> No
 
 
 def test_a_stream_keeps_recurrent_state_until_a_reset(connect: Connect, url: str) -> None:
+    """An error does not end it."""
     with connect(url).stream("memory") as stream:
         assert [stream.act(ONE) for _ in range(3)] == [0, 0, 1]
         assert [stream.act(ONE, reset=True), stream.act(ONE), stream.act(ONE)] == [0, 0, 1]
         batch = np.array([[1], [2]], np.float32)
-        with pytest.raises(InvalidState, match="a reset is required"):
+        with pytest.raises(errors.InvalidState, match="a reset is required"):
             stream.act_batch(batch)
+        with pytest.raises(errors.InvalidInput):
+            stream.act(object())
         assert stream.act_batch(batch, reset=True) == [0, 0]
         assert stream.act_batch(batch) == [0, 1]
         assert stream.act_batch(batch, reset=[False, True]) == [1, 0]
 
 
-def test_an_error_does_not_end_a_stream(connect: Connect, url: str) -> None:
-    with connect(url).stream("board") as stream:
-        first = stream.act(BOARD)
-        with pytest.raises(ObservationError, match="expected"):
-            stream.act({"observation": np.zeros(3, np.int8), "action_mask": np.ones(7, np.int8)})
-        with pytest.raises(InvalidInput):
-            stream.act({"observation": object()})
-        assert stream.act(BOARD) == first
-
-
-@pytest.mark.parametrize(("model", "expected"), [("nobody", UnknownLeague), ("headless", NotReady)])
-def test_a_stream_that_cannot_be_opened_raises(
-    connect: Connect, url: str, model: str, expected: type[Exception]
-) -> None:
-    with pytest.raises(expected) as raised, connect(url, retry_deadline=0.2).stream(model) as stream:
-        stream.act(BOARD)
-    assert type(raised.value) is expected
-
-
-def test_a_stream_to_an_unreachable_server_raises(connect: Connect) -> None:
+def test_what_cannot_start_raises(connect: Connect, url: str) -> None:
+    client = connect(url, retry_deadline=0.2)
+    for start, model, expected in (
+        (client.stream, "nobody", errors.UnknownLeague),
+        (client.stream, "headless", errors.NotReady),
+        (client.episode, "nobody", errors.UnknownLeague),
+        (client.episode, "board@99", errors.UnknownVersion),
+        (client.episode, "a.b.c", errors.InvalidReference),
+    ):
+        with pytest.raises(expected) as raised, start(model) as acting:
+            acting.act(BOARD)
+        assert type(raised.value) is expected
     with (
-        pytest.raises(RemoteError, match="stream: "),
-        connect("http://127.0.0.1:9", retry_deadline=0.1).stream("a") as stream,
+        pytest.raises(errors.RemoteError, match="stream: "),
+        connect(NO_SERVER, retry_deadline=0.1).stream("a") as stream,
     ):
         stream.act(BOARD)
-
-
-def test_a_message_that_is_too_large_is_not_retried(connect: Connect, url: str) -> None:
-    with connect(url).stream("choice") as stream, pytest.raises(BodyTooLarge):
+    with connect(url).stream("choice") as stream, pytest.raises(errors.BodyTooLarge):
         stream.act(np.zeros(SETTINGS.max_body, np.int8))
-
-
-def test_a_stream_is_pinned_or_follows_its_alias(connect: Connect, registry: Registry, listener: Listening) -> None:
-    client = connect(listener.url)
-    registry.aliases.set("board", "candidate", 3, expected=None, actor="test", reason="test")
-    with (
-        client.stream("board") as pinned,
-        client.stream("board", follow=True) as following,
-        client.stream("board@candidate", follow=True) as candidate,
-    ):
-        assert (pinned.version, pinned.last) == (None, None)
-        for stream in (pinned, following, candidate):
-            stream.act(BOARD)
-        assert [stream.version for stream in (pinned, following, candidate)] == [1, 1, 3]
-        promote(registry, "board", 2)
-        until(lambda: following.act(BOARD) is not None and following.version == 2)
-        for stream in (pinned, candidate):
-            stream.act(BOARD)
-        assert [stream.version for stream in (pinned, candidate)] == [1, 3]
 
 
 def abort_connections(listener: Listening) -> None:
@@ -129,11 +94,11 @@ def test_a_stream_continues_on_another_replica(
     (port,) = free_ports(1, "127.0.0.1")
     with listening(registry.storage, port=port) as first:
         client = connect(first.url)
-        one, two = client.stream("memory", follow=follow), client.stream("memory", follow=follow)
-        pinned = client.stream("board", follow=follow)
+        one, two, board = (client.stream(model, follow=follow) for model in ("memory", "memory", "board"))
+        assert (board.version, board.last) == (None, None)
         assert [one.act(ONE) for _ in range(2)] == [0, 0]
         assert two.act_batch([ONE, 2 * ONE]) == [0, 0]
-        pinned.act(BOARD)
+        board.act(BOARD)
         promote(registry, "board", 2)
         if not is_warned:
             abort_connections(first)
@@ -141,21 +106,11 @@ def test_a_stream_continues_on_another_replica(
     with listening(registry.storage, replica="replica-2", port=port):
         assert one.act(ONE) == 1
         assert two.act_batch([ONE, ONE], reset=[True, False]) == [0, 1]
-        pinned.act(BOARD)
-        assert pinned.version == (2 if follow else 1)
-        assert {stream.last.replica for stream in (one, two, pinned)} == {"replica-2"}
-        for stream in (one, two, pinned):
+        board.act(BOARD)
+        assert board.version == (2 if follow else 1)
+        assert {stream.last.replica for stream in (one, two, board)} == {"replica-2"}
+        for stream in (one, two, board):
             stream.close()
-
-
-def test_a_stream_whose_version_was_removed_raises(connect: Connect, registry: Registry) -> None:
-    (port,) = free_ports(1, "127.0.0.1")
-    with listening(registry.storage, port=port) as first:
-        stream = connect(first.url).stream("board@3")
-        stream.act(BOARD)
-    shutil.rmtree(registry.artifacts.path("board", 3))
-    with listening(registry.storage, port=port), pytest.raises(VersionRetired):
-        stream.act(BOARD)
 
 
 class Slow:
@@ -179,21 +134,30 @@ class Slow:
             connection.send(json.dumps({"action": number, "model": "board", "version": 1, "sha256": "0"}))
 
 
+@contextmanager
+def serving(respond: Callable[[ServerConnection], None], **head: str) -> Iterator[str]:
+    """The URL of a server whose handshakes have more headers."""
+
+    def add_headers(_: ServerConnection, __: Any, response: Any) -> None:
+        response.headers.update(head)
+
+    with serve(respond, "127.0.0.1", 0, process_response=add_headers) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.socket.getsockname()[1]}"
+        server.shutdown()
+    thread.join()
+
+
+VERSION = {"x-league-version": "1"}
+
+
 @pytest.fixture
 def slow() -> Iterator[tuple[Slow, str]]:
     handler = Slow()
-
-    def add_headers(connection: ServerConnection, _: Any, response: Any) -> None:
-        response.headers["x-league-version"] = "1"
-
-    server: Server
-    with serve(handler, "127.0.0.1", 0, process_response=add_headers) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        yield handler, f"http://127.0.0.1:{server.socket.getsockname()[1]}"
+    with serving(handler, **VERSION) as url:
+        yield handler, url
         handler.respond.set()
-        server.shutdown()
-    thread.join()
 
 
 def test_a_late_answer_is_not_taken_for_the_next_one(connect: Connect, slow: tuple[Slow, str]) -> None:
@@ -211,31 +175,24 @@ def test_a_retry_deadline_of_zero_disables_retries(connect: Connect, slow: tuple
     handler, url = slow
     handler.hangs_up = True
     with connect(url, retry_deadline=0).stream("board") as stream:
-        with pytest.raises(RemoteError, match="lost"):
+        with pytest.raises(errors.RemoteError, match="lost"):
             stream.act(BOARD)
         assert len(handler.received) == 1
 
 
-@pytest.mark.parametrize(("head", "body"), [({}, "{}"), ({"x-league-version": "1"}, "<html>")], ids=["header", "body"])
-def test_another_kind_of_server_is_reported(connect: Connect, head: dict[str, str], body: str) -> None:
-    def add_headers(_: ServerConnection, __: Any, response: Any) -> None:
-        response.headers.update(head)
+def test_another_kind_of_server_is_reported(connect: Connect) -> None:
+    for head, body, message in (({}, "{}", "contains no version"), (VERSION, "<html>", "did not return JSON")):
 
-    def respond(connection: ServerConnection) -> None:
-        for _ in connection:
-            connection.send(body)
+        def respond(connection: ServerConnection, body: str = body) -> None:
+            for _ in connection:
+                connection.send(body)
 
-    with serve(respond, "127.0.0.1", 0, process_response=add_headers) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        url = f"http://127.0.0.1:{server.socket.getsockname()[1]}"
         with (
-            pytest.raises(RemoteError, match=r"contains no version|did not return JSON"),
+            serving(respond, **head) as url,
+            pytest.raises(errors.RemoteError, match=message),
             connect(url).stream("board") as stream,
         ):
             stream.act(BOARD)
-        server.shutdown()
-    thread.join()
 
 
 def test_a_cancelled_action_leaves_no_answer_behind(slow: tuple[Slow, str]) -> None:
@@ -253,3 +210,64 @@ def test_a_cancelled_action_leaves_no_answer_behind(slow: tuple[Slow, str]) -> N
             return [await stream.act(BOARD) for _ in range(2)]
 
     assert asyncio.run(cancel()) == [2, 3]
+
+
+def test_an_episode_keeps_its_version_across_promotions(
+    connect: Connect, registry: Registry, listener: Listening
+) -> None:
+    client = connect(listener.url)
+    registry.aliases.set("board", "candidate", 3, expected=None, actor="test", reason="test")
+    with client.episode("board") as episode, client.episode("board@candidate") as of_alias:
+        assert (episode.version, episode.last, episode.steps) == (None, None, 0)
+        first, _ = episode.act(BOARD), of_alias.act(BOARD)
+        promote(registry, "board", 2)
+        registry.aliases.set("board", "candidate", 1, expected=3, actor="test", reason="test")
+        until(lambda: client.act("board", BOARD).version == 2)
+        assert [episode.act(BOARD) for _ in range(3)] == [first] * 3
+        of_alias.act(BOARD)
+        assert (episode.version, episode.steps, episode.last.version, of_alias.version) == (1, 4, 1, 3)
+    with client.episode("board") as episode:
+        episode.act(BOARD)
+        assert episode.version == 2
+
+
+def test_an_episode_carries_its_recurrent_state(connect: Connect, url: str) -> None:
+    client = connect(url)
+    with client.episode("memory") as one, client.episode("memory") as other:
+        assert [one.act(ONE) for _ in range(4)] == [0, 0, 1, 1]
+        assert [other.act(ONE) for _ in range(3)] == [0, 0, 1]
+
+
+def test_an_exploring_episode_is_reproducible(connect: Connect, url: str) -> None:
+    def play(seed: int | None) -> list[int]:
+        with connect(url).episode("board", explore=True, seed=seed) as episode:
+            return [episode.act(BOARD) for _ in range(30)]
+
+    assert play(1) == play(1) != play(2)
+    assert len(set(play(1))) > 1
+    assert play(None) != play(None)
+    with connect(url).episode("board", explore=True, seed=1) as episode:
+        action = episode.act(BOARD, probabilities=True)
+        assert episode.last is not None
+        assert episode.last.probabilities[action] > 0
+        alone = connect(url).act("board@1", BOARD, explore=True, seed=episode.last.seed)
+        assert alone.action == action
+
+
+def test_an_episode_survives_its_replica_but_not_its_version(connect: Connect, registry: Registry) -> None:
+    (port,) = free_ports(1, "127.0.0.1")
+    with listening(registry.storage, port=port) as first:
+        client = connect(first.url)
+        episode, other, stream = client.episode("memory"), client.episode("board@3"), client.stream("board@3")
+        assert [episode.act(ONE) for _ in range(2)] == [0, 0]
+        for acting in (other, stream):
+            acting.act(BOARD)
+    shutil.rmtree(registry.artifacts.path("board", 3))
+    with listening(registry.storage, replica="replica-2", port=port):
+        assert episode.act(ONE) == 1
+        assert episode.last is not None
+        assert episode.last.replica == "replica-2"
+        with pytest.raises(errors.VersionRetired, match=r"cannot continue after 1 actions of board@3"):
+            other.act(BOARD)
+        with pytest.raises(errors.VersionRetired):
+            stream.act(BOARD)

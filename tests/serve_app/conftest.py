@@ -1,5 +1,4 @@
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -36,13 +35,6 @@ def client(registry: Registry) -> Iterator[TestClient]:
     """A replica's application, without Ray, that follows `registry`."""
     with replica(registry.storage) as client:
         yield client
-
-
-@pytest.fixture(scope="module")
-def shared_registry(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Registry]:
-    """Leagues of each kind, for requests that are refused."""
-    with closing(everything(Storage.at(tmp_path_factory.mktemp("shared")))) as registry:
-        yield registry
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-import shutil
 import signal
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -141,19 +140,6 @@ def test_a_locked_database(url: str, registry: Registry) -> None:
         blocker.execute("ROLLBACK")
         promote_everywhere(registry, 1)
     blocker.close()
-
-
-def test_the_artifacts_of_the_served_version(url: str, registry: Registry) -> None:
-    promote_everywhere(registry, 1)
-    path = registry.artifacts.path("board", 1)
-    with without_failures(url) as result, httpx.Client(base_url=url) as client:
-        shutil.copytree(path, path.with_name("kept"))
-        shutil.rmtree(path)
-        wait_for_calls(result, 500)
-        assert client.post(ACTION, json={"observation": BOARD}).json()["version"] == 1
-        promote_everywhere(registry, 2)
-        path.with_name("kept").rename(path)
-    assert result.versions.keys() == {1, 2}
 
 
 def test_slow_clients_do_not_affect_others(url: str) -> None:

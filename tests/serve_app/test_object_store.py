@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -17,26 +18,20 @@ from tests.support.servers.replicas import replica
 from tests.support.waiting import until
 
 
+@dataclass
 class Store:
     """A running store. url: of its artefacts; the environment has its credentials."""
 
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self._running = ExitStack()
-        self.endpoint = self._running.enter_context(object_store.server())
-        for name, value in object_store.variables(self.endpoint).items():
-            patch.setenv(name, value)
-        self.url = object_store.create_bucket(self.endpoint)
-
-    def close(self) -> None:
-        """Stop the server."""
-        self._running.close()
+    running: ExitStack
+    endpoint: str
+    url: str
 
     @contextmanager
     def unreachable(self) -> Iterator[None]:
         """Stop the server for a while."""
-        self.close()
+        self.running.close()
         yield
-        self._running.enter_context(object_store.server(int(self.endpoint.rpartition(":")[2])))
+        self.running.enter_context(object_store.server(int(self.endpoint.rpartition(":")[2])))
 
     def refusing_credentials(self) -> AbstractContextManager[None]:
         """Refuse the credentials for a while."""
@@ -53,9 +48,11 @@ class Store:
 
 @pytest.fixture
 def store(monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    store = Store(monkeypatch)
-    yield store
-    store.close()
+    with ExitStack() as running:
+        endpoint = running.enter_context(object_store.server())
+        for name, value in object_store.variables(endpoint).items():
+            monkeypatch.setenv(name, value)
+        yield Store(running, endpoint, object_store.create_bucket(endpoint))
 
 
 @pytest.mark.parametrize(
@@ -85,9 +82,9 @@ def test_a_fault_of_the_store_costs_no_action(
         with fault(store):
             promote(registry, "board", 2)
             until(lambda: client.get("/v1/leagues/board").json()["faults"])
-            found = [line for line in caplog.messages if "cannot switch to version 2, version 1 stays" in line]
-            assert message in found[0]
-            assert "\n" not in found[0]
+            lines = [line for line in caplog.messages if "cannot switch to version 2, version 1 stays" in line]
+            assert message in lines[0]
+            assert "\n" not in lines[0]
             assert act(client, observation=BOARD)["version"] == 1
         until(lambda: act(client, observation=BOARD)["version"] == 2)
     registry.close()

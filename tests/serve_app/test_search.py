@@ -1,16 +1,15 @@
-"""Search versions are served like others, by the search service."""
+"""Search versions are served like others, by the search service, whose calls share messages."""
 
 import asyncio
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Awaitable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from httpx import Response
 from starlette.testclient import TestClient
 
+from league.errors import GraphTimeout
 from league.policies.policy import Policy
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
@@ -20,7 +19,7 @@ from league.settings import Storage
 from league.spaces import ACTION_MASK, OBSERVATION
 from policy_league_client.requests import ActionRequest, BatchActionRequest
 from policy_league_client.responses import parse_action_response, parse_batch_action_response
-from serve_app.live_versions.remote_search import MESSAGES
+from serve_app.live_versions.remote_search import MESSAGES, CallQueue, SearchClient
 from tests.support.clients.triton import Triton
 from tests.support.leagues import tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
@@ -82,53 +81,32 @@ BOARDS = [position(actions) for actions in GAMES]
 PATH = f"/v1/policies/{LEAGUE}/action"
 
 
-def test_all_protocols_return_the_actions_of_the_search(
-    registry: Registry, served: tuple[TestClient, LocalHandle]
-) -> None:
-    client, _ = served
+REQUEST = {"observation": BOARDS[0]}
+
+
+def test_all_protocols_return_the_actions_of_the_search(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     arrays = {name: np.array([board[name] for board in BOARDS], dtype=np.int8) for name in BOARDS[0]}
     expected = searched(registry).act(arrays)
-    batch = client.post(f"{PATH}?version={SEARCH}", json={"observations": BOARDS, "probabilities": True}).json()
-    assert batch["actions"] == expected.actions.tolist()
-    assert (batch["version"], batch["simulations"]) == (SEARCH, [50] * len(BOARDS))
-    assert np.allclose(batch["probabilities"], np.exp(expected.dist_inputs))
-    alone = client.post(f"{PATH}?version={SEARCH}", json={"observation": BOARDS[1]}).json()
-    assert (alone["action"], alone["simulations"]) == (batch["actions"][1], 50)
-    inputs = [
-        {"name": name, "datatype": "INT8", "shape": array.shape, "data": array.ravel().tolist()}
-        for name, array in arrays.items()
-    ]
-    path = f"/v2/models/{LEAGUE}/versions/{SEARCH}/infer"
-    outputs = {
-        output["name"]: output["data"] for output in client.post(path, json={"inputs": inputs}).json()["outputs"]
-    }
-    assert outputs["action"] == batch["actions"]
-    with client.websocket_connect(f"/v1/policies/{LEAGUE}/stream?version={SEARCH}") as stream:
-        stream.send_json({"observations": BOARDS})
-        assert stream.receive_json()["actions"] == batch["actions"]
-
-
-def test_triton_clients_call_it_by_grpc(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    arrays = {name: np.array([board[name] for board in BOARDS], dtype=np.int8) for name in BOARDS[0]}
     server, _ = searching_server(registry, monkeypatch)
-    with Listening(server) as address, Triton("grpc", address) as triton:
-        result = triton.infer(LEAGUE, arrays, version=str(SEARCH), outputs=("action", "action_dist_inputs"))
-    expected = searched(registry).act(arrays)
-    assert result.as_numpy("action").tolist() == expected.actions.tolist()
-    assert np.allclose(result.as_numpy("action_dist_inputs"), expected.dist_inputs)
-
-
-def test_it_answers_a_share_of_requests_as_a_canary(registry: Registry, served: tuple[TestClient, LocalHandle]) -> None:
-    client, _ = served
-    registry.traffic.set(LEAGUE, canary=Portion(SEARCH, 0.5), actor="test", reason="test")
-
-    def versions() -> set[int]:
-        callers = [
-            client.post(PATH, json={"observation": BOARDS[0]}, headers={"x-league-key": str(i)}) for i in range(16)
-        ]
-        return {reply.json()["version"] for reply in callers}
-
-    until(lambda: versions() == {1, SEARCH})
+    with local_client(server) as client:
+        body = {"observations": BOARDS, "probabilities": True}
+        batch = client.post(f"{PATH}?version={SEARCH}", json=body).json()
+        assert batch["actions"] == expected.actions.tolist()
+        assert (batch["version"], batch["simulations"]) == (SEARCH, [50] * len(BOARDS))
+        assert np.allclose(batch["probabilities"], np.exp(expected.dist_inputs))
+        alone = client.post(f"{PATH}?version={SEARCH}", json={"observation": BOARDS[1]}).json()
+        assert (alone["action"], alone["simulations"]) == (batch["actions"][1], 50)
+        with client.websocket_connect(f"/v1/policies/{LEAGUE}/stream?version={SEARCH}") as stream:
+            stream.send_json({"observations": BOARDS})
+            assert stream.receive_json()["actions"] == batch["actions"]
+    server, _ = searching_server(registry, monkeypatch)
+    with Listening(server) as address:
+        for form in ("http", "grpc"):
+            with Triton(form, address) as triton:
+                outputs = ("action", "action_dist_inputs")
+                result = triton.infer(LEAGUE, arrays, version=str(SEARCH), outputs=outputs)
+            assert result.as_numpy("action").tolist() == expected.actions.tolist()
+            assert np.allclose(result.as_numpy("action_dist_inputs"), expected.dist_inputs)
 
 
 def test_the_leaderboard_shows_searches(registry: Registry, served: tuple[TestClient, LocalHandle]) -> None:
@@ -143,31 +121,24 @@ def test_the_leaderboard_shows_searches(registry: Registry, served: tuple[TestCl
     assert [row["search"] for row in others] == [None, None]
 
 
-def test_a_search_version_is_promoted_and_rolled_back(
+def test_a_search_version_is_a_canary_a_shadow_and_a_champion(
     registry: Registry, served: tuple[TestClient, LocalHandle]
 ) -> None:
     client, _ = served
 
-    def champion() -> int:
-        return int(client.post(PATH, json={"observation": BOARDS[0]}).json()["version"])
+    def versions() -> set[int]:
+        replies = [client.post(PATH, json=REQUEST, headers={"x-league-key": str(caller)}) for caller in range(16)]
+        return {reply.json()["version"] for reply in replies}
 
-    until(lambda: champion() == 1)
+    registry.traffic.set(LEAGUE, canary=Portion(SEARCH, 0.5), actor="test", reason="test")
+    until(lambda: versions() == {1, SEARCH})
+    shadow = Portion(SEARCH, 1.0)
+    registry.traffic.set(LEAGUE, canary=None, shadow=shadow, actor="test", reason="test")
+    until(lambda: versions() == {1} and value(client, "league_shadow_requests_total", league=LEAGUE) > 0)
     promote(registry, SEARCH)
-    until(lambda: champion() == SEARCH)
+    until(lambda: versions() == {SEARCH})
     registry.aliases.rollback(LEAGUE, actor="test", reason="test")
-    until(lambda: champion() == 1)
-
-
-def test_it_is_compared_as_a_shadow(registry: Registry, served: tuple[TestClient, LocalHandle]) -> None:
-    client, _ = served
-    registry.traffic.set(LEAGUE, shadow=Portion(SEARCH, 1.0), actor="test", reason="test")
-
-    def compared() -> float:
-        client.post(PATH, json={"observation": BOARDS[1]})
-        return value(client, "league_shadow_requests_total", league=LEAGUE)
-
-    until(lambda: compared() > 0)
-    assert value(client, "league_shadow_agreed_total", league=LEAGUE) >= 0
+    until(lambda: versions() == {1})
 
 
 def test_a_deadline_ends_a_search_and_an_analysis_explains_it(served: tuple[TestClient, LocalHandle]) -> None:
@@ -189,67 +160,89 @@ def test_a_deadline_ends_a_search_and_an_analysis_explains_it(served: tuple[Test
     assert row.simulations == sum(row.analysis.visits)
 
 
-@pytest.mark.parametrize(
-    ("body", "version", "message"),
-    [
+def test_what_cannot_be_searched_is_refused(registry: Registry, served: tuple[TestClient, LocalHandle]) -> None:
+    client, _ = served
+    impossible = position((0, 1, 2)) | {OBSERVATION: [[[1, 1]] * 3] * 3}
+    for body, version, message in (
         ({"deadline_ms": 0}, SEARCH, "deadline_ms must be null or an integer from 1 to 86400000"),
         ({"analysis": True}, 1, "analysis is true, but this version does not search"),
-        ({"observation": position((0, 1, 2)) | {OBSERVATION: [[[1, 1]] * 3] * 3}}, SEARCH, "not a position"),
-    ],
-)
-def test_what_cannot_be_searched_is_refused(
-    served: tuple[TestClient, LocalHandle], body: dict, version: int, message: str
-) -> None:
-    client, _ = served
-    reply = client.post(f"{PATH}?version={version}", json={"observation": BOARDS[0]} | body)
-    assert reply.status_code == 400
-    assert message in reply.json()["message"]
+        ({"observation": impossible}, SEARCH, "not a position"),
+    ):
+        reply = client.post(f"{PATH}?version={version}", json=REQUEST | body)
+        assert (reply.status_code, message in reply.json()["message"]) == (400, True)
+    with replica(registry.storage) as without_service:
+        reply = without_service.post(f"{PATH}?version={SEARCH}", json=REQUEST)
+        assert (reply.status_code, reply.json()["code"]) == (503, "no_search_service")
+        assert without_service.post(PATH, json=REQUEST).json()["version"] == 1
 
 
 def test_a_call_whose_process_ends_is_repeated(served: tuple[TestClient, LocalHandle]) -> None:
     client, handle = served
-    assert client.post(f"{PATH}?version={SEARCH}", json={"observation": BOARDS[0]}).status_code == 200
-    handle.deaths = 3
-    assert client.post(f"{PATH}?version={SEARCH}", json={"observation": BOARDS[0]}).status_code == 200
-    assert handle.deaths == 0
+    for deaths in (0, 3):
+        handle.deaths = deaths
+        assert client.post(f"{PATH}?version={SEARCH}", json=REQUEST).status_code == 200
+        assert handle.deaths == 0
     until(lambda: handle.calls.count("stay") > 0)
 
 
-def test_requests_that_wait_together_share_a_message(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    server, handle = searching_server(registry, monkeypatch)
-    sizes, released, call = list[int](), asyncio.Event(), handle.call
+class HeldService:
+    """Stands for the handle: answers each message with its calls, once `released` is set."""
 
-    async def hold(method: str, *arguments: Any) -> Any:
-        if method == "searches":
-            sizes.append(len(arguments[0]))
-            await released.wait()
-        return await call(method, *arguments)
+    def __init__(self) -> None:
+        self.released = asyncio.Event()
+        self.messages: list[list[tuple[object, ...]]] = []
+        self.ended = 0
 
-    with local_client(server) as client, ThreadPoolExecutor(10) as requests:
+    @property
+    def searches(self) -> "HeldService":
+        return self
 
-        def request(board: dict[str, list]) -> "Future[Response]":
-            return requests.submit(client.post, f"{PATH}?version={SEARCH}", json={"observation": board})
+    def remote(self, calls: list[tuple[object, ...]]) -> Awaitable[list[dict[str, Any]]]:
+        """A message."""
+        self.messages.append(calls)
+        return self._answer(calls)
 
-        assert request(BOARDS[0]).result().status_code == 200
-        version = server.versions.cached(LEAGUE, SEARCH)
-        assert version is not None
-        search = version.policy(None).search
-        assert search is not None
-        monkeypatch.setattr(handle, "call", hold)
-        replies = [request(BOARDS[0]) for _ in range(MESSAGES)]
-        until(lambda: sizes == [1] * MESSAGES)
-        replies += [request(board) for board in 2 * BOARDS]
-        until(lambda: len(search._queue.waiting) == 2 * len(BOARDS))
-        assert client.portal is not None
-        client.portal.call(released.set)
-        answers = [reply.result().json() for reply in replies]
-    assert sizes == [*[1] * MESSAGES, 2 * len(BOARDS)]
-    assert [answer["simulations"] for answer in answers] == [50] * len(answers)
-    assert [answer["action"] for answer in answers[MESSAGES:-4]] == [answer["action"] for answer in answers[-4:]]
+    async def _answer(self, calls: list[tuple[object, ...]]) -> list[dict[str, Any]]:
+        try:
+            await self.released.wait()
+        except asyncio.CancelledError:
+            self.ended += 1
+            raise
+        return [{"call": call[0]} for call in calls]
 
 
-def test_a_server_without_search_service_says_so(registry: Registry) -> None:
-    with replica(registry.storage) as client:
-        reply = client.post(f"{PATH}?version={SEARCH}", json={"observation": BOARDS[0]})
-        assert (reply.status_code, reply.json()["code"]) == (503, "no_search_service")
-        assert client.post(PATH, json={"observation": BOARDS[0]}).json()["version"] == 1
+@pytest.mark.anyio
+@pytest.mark.parametrize("processes", [1, 3])
+async def test_calls_that_wait_are_divided_among_the_messages(processes: int) -> None:
+    service = HeldService()
+    client, queue = SearchClient(service, processes), CallQueue()  # type: ignore[arg-type]
+    async with client.running():
+        calls = [asyncio.wrap_future(client.search(queue, lambda i=i: (i,), 60.0)) for i in range(20)]  # type: ignore[misc]
+        await until_sent(service, MESSAGES * processes)
+        service.released.set()
+        assert [response["call"] for response in await asyncio.gather(*calls)] == list(range(20))
+    assert sorted(call[0] for calls in service.messages for call in calls) == list(range(20))
+    assert MESSAGES * processes < len(service.messages) < 20
+
+
+@pytest.mark.anyio
+async def test_abandoned_calls_are_not_sent_and_their_message_ends() -> None:
+    service = HeldService()
+    client, queue = SearchClient(service, 1), CallQueue()  # type: ignore[arg-type]
+    async with client.running():
+        sent = [asyncio.wrap_future(client.search(queue, lambda: ("sent",), 60.0)) for _ in range(MESSAGES)]
+        await until_sent(service, MESSAGES)
+        with pytest.raises(GraphTimeout, match=r"did not respond within 0\.01 s"):
+            await asyncio.wrap_future(client.search(queue, lambda: ("late",), 0.01))
+        sent[0].cancel()
+        while not service.ended:
+            await asyncio.sleep(0)
+        service.released.set()
+        assert (await sent[1])["call"] == "sent"
+        assert await asyncio.wrap_future(client.search(queue, lambda: ("next",), 60.0)) == {"call": "next"}
+    assert [calls for calls in service.messages if ("late",) in calls] == []
+
+
+async def until_sent(service: HeldService, number: int) -> None:
+    while len(service.messages) < number:
+        await asyncio.sleep(0)

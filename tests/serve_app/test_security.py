@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -28,17 +29,23 @@ from onnx import TensorProto, helper
 from sqlalchemy import update
 from starlette.testclient import TestClient
 
+from league.errors import ArtifactCorrupt, LeagueError
 from league.registry.registry import Registry
 from league.registry.storage.manifest import MANIFEST, Manifest
 from league.registry.storage.tables import VersionTable
 from serve_app.inference.stream_codec import FRAMING, REQUEST
-from tests.support.clients.actions import BOARD, act
+from serve_app.live_versions import version_cache
+from serve_app.live_versions.version_cache import ActionSelections
+from tests.support.clients.actions import BOARD, act, rejected
 from tests.support.leagues.served_leagues import promote, publish
 from tests.support.policies.graphs import masked_mlp
 from tests.support.policies.probes import probes
 from tests.support.waiting import until
 
 SUSPICIOUS = frozenset(("pickle.find_class", "os.system", "os.exec", "subprocess.Popen", "os.posix_spawn"))
+
+
+GRAPH, PROBES = "shared.onnx", "shared.probes.npz"
 _watched: list[str] | None = None
 _threads: set[threading.Thread] = set()
 """That of the test, those that it has started, and so on. Ray's and those of other replicas may unpickle."""
@@ -151,35 +158,6 @@ def foreign_operator(path: Path) -> bytes:
     return model.SerializeToString()
 
 
-GRAPHS: dict[str, Callable[[bytes, Path], bytes]] = {
-    "a pickle": lambda trap, _: trap,
-    "a checkpoint of torch": lambda trap, _: torch_checkpoint(trap),
-    "an archive": lambda trap, _: tar_bomb(trap),
-    "compressed zeros": lambda _, __: gzip.compress(bytes(50 * 2**20)),
-    "weights in another file": lambda _, mark: outside_weights(mark),
-    "weights in a relative path": lambda _, mark: outside_weights(Path("..") / ".." / mark.name),
-    "an operator of Python": lambda _, mark: foreign_operator(mark),
-    "nothing": lambda _, __: b"",
-}
-
-
-@pytest.mark.parametrize("kind", GRAPHS)
-def test_a_malicious_graph_is_rejected_and_the_champion_remains(
-    client: TestClient, registry: Registry, trap: bytes, mark: Path, kind: str
-) -> None:
-    """Published with correct digests, as by an attacker who may publish."""
-    graph = masked_mlp(seed=0)
-    version = publish(registry, "board", {"shared": graph}, "run/trap")
-    replace_version(registry, version.number, version.manifest, {"shared.onnx": GRAPHS[kind](trap, mark)})
-    with nothing_executed():
-        promote(registry, "board", version.number)
-        until(lambda: faults(client))
-        assert act(client, observation=BOARD)["version"] == 1
-        reply = client.post(f"/v1/policies/board/action?version={version.number}", json={"observation": BOARD})
-        assert (reply.status_code, reply.json()["code"]) == (503, "artifact_corrupt")
-    assert not mark.exists()
-
-
 def pickled_array(trap: bytes) -> bytes:
     """An array of objects in NumPy's format: a header and a pickle."""
     buffer = io.BytesIO()
@@ -200,111 +178,109 @@ def damaged(content: bytes) -> bytes:
     return content[:60] + b"\xff" * 20 + content[80:]
 
 
-RECORDED: dict[str, Callable[[bytes], bytes]] = {
-    "a pickle": lambda trap: trap,
-    "an array of objects": pickled_array,
-    "an archive with an array of objects": lambda trap: archive(pickled_array(trap)),
-    "an archive with a pickle": lambda trap: archive(trap),
-    "an archive with a pickle of another name": lambda trap: archive(trap, "action.pkl"),
-    "a checkpoint of torch": torch_checkpoint,
-    "a damaged archive": lambda trap: damaged(archive(pickled_array(trap) + os.urandom(1000))),
-    "an archive of zeros": lambda _: archive(bytes(300 * 2**20)),
+FILES: dict[tuple[str, str], Callable[[bytes, Path], bytes]] = {
+    (GRAPH, "a pickle"): lambda trap, _: trap,
+    (GRAPH, "a checkpoint of torch"): lambda trap, _: torch_checkpoint(trap),
+    (GRAPH, "an archive"): lambda trap, _: tar_bomb(trap),
+    (GRAPH, "compressed zeros"): lambda _, __: gzip.compress(bytes(50 * 2**20)),
+    (GRAPH, "weights in another file"): lambda _, mark: outside_weights(mark),
+    (GRAPH, "weights in a relative path"): lambda _, mark: outside_weights(Path("..") / ".." / mark.name),
+    (GRAPH, "an operator of Python"): lambda _, mark: foreign_operator(mark),
+    (GRAPH, "nothing"): lambda _, __: b"",
+    (PROBES, "a pickle"): lambda trap, _: trap,
+    (PROBES, "an array of objects"): lambda trap, _: pickled_array(trap),
+    (PROBES, "an archive with an array of objects"): lambda trap, _: archive(pickled_array(trap)),
+    (PROBES, "an archive with a pickle"): lambda trap, _: archive(trap),
+    (PROBES, "an archive with a pickle of another name"): lambda trap, _: archive(trap, "action.pkl"),
+    (PROBES, "a checkpoint of torch"): lambda trap, _: torch_checkpoint(trap),
+    (PROBES, "a damaged archive"): lambda trap, _: damaged(archive(pickled_array(trap) + os.urandom(1000))),
+    (PROBES, "an archive of zeros"): lambda _, __: archive(bytes(300 * 2**20)),
 }
 
 
-@pytest.mark.parametrize("kind", RECORDED)
-def test_malicious_probes_are_rejected_and_the_champion_remains(
-    client: TestClient, registry: Registry, trap: bytes, mark: Path, kind: str
-) -> None:
+def load(registry: Registry, number: int) -> None:
+    """Load a version, as a replica does."""
+    version_cache.load(registry, "board", number, 0.001, ActionSelections())
+
+
+def test_a_malicious_file_is_rejected(registry: Registry, trap: bytes, mark: Path, subtests: pytest.Subtests) -> None:
+    """Published with correct digests, as by an attacker who may publish."""
     version = publish(registry, "board", {"shared": masked_mlp(seed=0)}, "run/trap", {"shared": probes()})
-    replace_version(registry, version.number, version.manifest, {"shared.probes.npz": RECORDED[kind](trap)})
-    with nothing_executed():
-        promote(registry, "board", version.number)
-        until(lambda: "contains no probes" in (faults(client) or [""])[0])
-        assert act(client, observation=BOARD)["version"] == 1
+    directory = registry.artifacts.path("board", version.number)
+    valid = {name: (directory / name).read_bytes() for name in (GRAPH, PROBES)}
+    for (name, kind), create in FILES.items():
+        replace_version(registry, version.number, version.manifest, valid | {name: create(trap, mark)})
+        message = "contains no probes" if name == PROBES else ""
+        with subtests.test(name, kind=kind), nothing_executed(), pytest.raises(ArtifactCorrupt, match=message):
+            load(registry, version.number)
+        assert not mark.exists()
+    replace_version(registry, version.number, version.manifest, valid)
+    load(registry, version.number)
+    (directory / "weights.pkl").write_bytes(trap)
+    with nothing_executed(), pytest.raises(ArtifactCorrupt, match=f"does not belong to board@{version.number}"):
+        load(registry, version.number)
     assert not mark.exists()
 
 
-def test_a_pickle_beside_the_files_of_the_manifest_is_rejected(
+def test_the_champion_remains_when_a_malicious_version_is_promoted(
     client: TestClient, registry: Registry, trap: bytes, mark: Path
 ) -> None:
-    (registry.artifacts.path("board", 2) / "weights.pkl").write_bytes(trap)
+    version = publish(registry, "board", {"shared": masked_mlp(seed=0)}, "run/trap")
+    replace_version(registry, version.number, version.manifest, {GRAPH: trap})
     with nothing_executed():
+        promote(registry, "board", version.number)
+        until(lambda: client.get("/v1/leagues/board").json().get("faults"))
+        assert act(client, observation=BOARD)["version"] == 1
+        error = rejected(client, {"observation": BOARD}, 503, params={"version": version.number})
+        assert error["code"] == "artifact_corrupt"
         promote(registry, "board", 2)
-        until(lambda: "does not belong to board@2" in (faults(client) or [""])[0])
+        until(lambda: act(client, observation=BOARD)["version"] == 2)
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("name", ["../2/shared.onnx", "/etc/passwd", "missing.onnx", ".", "", "shared.onnx/x"])
-def test_a_manifest_with_other_paths_is_rejected(client: TestClient, registry: Registry, name: str) -> None:
-    version = publish(registry, "board", {"shared": masked_mlp(seed=1)}, "run/trap")
-    policy = version.manifest.policies["shared"].model_copy(update={"file": name})
-    replace_version(registry, version.number, version.manifest.model_copy(update={"policies": {"shared": policy}}), {})
-    promote(registry, "board", version.number)
-    until(lambda: faults(client))
-    assert act(client, observation=BOARD)["version"] == 1
-    promote(registry, "board", 2)
-    until(lambda: act(client, observation=BOARD)["version"] == 2)
-
-
-@pytest.mark.parametrize("name", ["../../outside", "/etc/passwd"])
-def test_a_digest_of_an_external_file_is_rejected(client: TestClient, registry: Registry, name: str) -> None:
+def test_a_manifest_with_other_paths_is_rejected(registry: Registry, subtests: pytest.Subtests) -> None:
     version = publish(registry, "board", {"shared": masked_mlp(seed=1)}, "run/trap")
     (registry.artifacts.root / "outside").write_bytes(b"not this league's")
-    files = version.manifest.files | {name: "0" * 64}
-    replace_version(registry, version.number, version.manifest.model_copy(update={"files": files}), {})
-    promote(registry, "board", version.number)
-    until(lambda: "is missing" in (faults(client) or [""])[0])
-    assert act(client, observation=BOARD)["version"] == 1
+    policy, files = version.manifest.policies["shared"], version.manifest.files
+    changes: list[dict[str, Any]] = [
+        {"policies": {"shared": policy.model_copy(update={"file": name})}}
+        for name in ("../2/shared.onnx", "/etc/passwd", "missing.onnx", ".", "", "shared.onnx/x")
+    ]
+    changes += [{"files": files | {name: "0" * 64}} for name in ("../../outside", "/etc/passwd")]
+    for change in changes:
+        replace_version(registry, version.number, version.manifest.model_copy(update=change), {})
+        message = "is missing" if "files" in change else ""
+        with subtests.test(change=change), pytest.raises(LeagueError, match=message):
+            load(registry, version.number)
 
 
 def as_symbolic_link(path: Path) -> None:
     secret = path.parent.parent / "secret"
     secret.write_text("somebody else's")
-    path.unlink()
     path.symlink_to(secret)
 
 
-def as_pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-def as_directory(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def as_device(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("/dev/zero")
-
-
-def remove_directory(path: Path) -> None:
-    shutil.rmtree(path.parent)
-
-
-@pytest.mark.parametrize("file", ["shared.onnx", MANIFEST])
-@pytest.mark.parametrize("replace", [as_symbolic_link, as_pipe, as_directory, as_device, remove_directory])
-def test_a_special_file_is_rejected_without_blocking(
-    client: TestClient, registry: Registry, replace: Callable[[Path], None], file: str
-) -> None:
-    replace(registry.artifacts.path("board", 3) / file)
-    promote(registry, "board", 3)
-    until(lambda: faults(client))
-    assert act(client, observation=BOARD)["version"] == 1
-    promote(registry, "board", 2)
-    until(lambda: act(client, observation=BOARD)["version"] == 2)
+def test_a_special_file_is_rejected_without_blocking(registry: Registry, subtests: pytest.Subtests) -> None:
+    directory = registry.artifacts.path("board", 3)
+    valid = shutil.copytree(directory, directory.with_name("valid"))
+    for name in (GRAPH, MANIFEST):
+        for replace in (as_symbolic_link, os.mkfifo, Path.mkdir, lambda path: path.symlink_to("/dev/zero"), Path.touch):
+            (directory / name).unlink()
+            replace(directory / name)
+            with subtests.test(name, replace=replace), pytest.raises(LeagueError):
+                load(registry, 3)
+            shutil.rmtree(directory)
+            with subtests.test("no directory"), pytest.raises(LeagueError):
+                load(registry, 3)
+            shutil.copytree(valid, directory)
+    load(registry, 3)
 
 
 TYPES = ("application/json", "application/octet-stream", "application/x-pickle", "application/python-pickle", None)
 PATHS = ("/v1/policies/board/action", "/v2/models/board/infer", "/v2/repository/index", "/v1/leagues/board/rollback")
 
 
-@pytest.mark.parametrize("path", PATHS)
-def test_a_malicious_request_is_rejected(
-    client: TestClient, registry: Registry, trap: bytes, mark: Path, path: str
-) -> None:
+def test_a_malicious_request_is_rejected(client: TestClient, registry: Registry, trap: bytes, mark: Path) -> None:
     _, token = registry.keys.create("all", ["act", "read", "promote"])
     text = base64.b64encode(trap).decode()
     bodies: list[bytes] = [
@@ -325,18 +301,16 @@ def test_a_malicious_request_is_rejected(
         b'{"observation": [1], "state": {"state_in_0": "%s"}}' % text.encode(),
         b"!!python/object/apply:os.system ['touch %s']" % str(mark).encode(),
     ]
+    client.headers.update({"x-api-key": token, "idempotency-key": "a"})
+    bomb = zlib.compress(bytes(60 * 2**20), 9)
+    requests = [(body, {} if kind is None else {"content-type": kind}) for body in bodies for kind in TYPES]
     with nothing_executed():
-        for body in bodies:
-            for media_type in TYPES:
-                headers = {"x-api-key": token, "idempotency-key": "a"}
-                headers |= {} if media_type is None else {"content-type": media_type}
+        for path in PATHS:
+            for body, headers in (*requests, (bomb, {"content-encoding": "deflate"})):
                 reply = client.post(path, content=body, headers=headers)
                 assert 400 <= reply.status_code < 500, reply.text
-        body = zlib.compress(bytes(60 * 2**20), 9)
-        reply = client.post(path, content=body, headers={"x-api-key": token, "content-encoding": "deflate"})
-        assert 400 <= reply.status_code < 500, "a decompression bomb"
     assert not mark.exists()
-    reply = client.post("/v1/policies/board/action", json={"observation": BOARD}, headers={"x-api-key": token})
+    reply = client.post("/v1/policies/board/action", json={"observation": BOARD})
     assert reply.json()["version"] == 1
 
 
@@ -363,8 +337,3 @@ def replace_version(registry: Registry, number: int, manifest: Manifest, files: 
     with registry.database.write() as session:
         values = {"manifest": text, "sha256": hashlib.sha256(text.encode()).hexdigest()}
         session.execute(update(VersionTable).filter_by(league=manifest.league, number=number).values(values))
-
-
-def faults(client: TestClient) -> list[str]:
-    """Those of the league board; none as long as the server is too busy to answer."""
-    return client.get("/v1/leagues/board").json().get("faults", [])

@@ -1,12 +1,13 @@
-"""A real server with Ray Serve, HAProxy and two replicas, under load, promotions and faults."""
+"""A real server with Ray Serve, HAProxy and two replicas, under load, promotions and faults, in all protocols."""
 
 import os
 import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from ipaddress import ip_address
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,13 @@ import httpx
 import numpy as np
 import psutil
 import pytest
+import tritonclient.grpc
 from filelock import FileLock
+from tritonclient.utils import InferenceServerException
 from websockets.exceptions import ConnectionClosed
 
 from evaluation.documents import EvaluationReport
 from evaluation.matches.tournament import evaluate
-from league.policies.onnx import OnnxPolicy
-from league.policies.open_inference import OpenInferencePolicy
-from league.refs import RemoteRef
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from league.results.ledger import Ledger
@@ -30,13 +30,16 @@ from league.results.records import Match
 from league.settings import Storage
 from policy_league_client import Client, Stream
 from policy_league_client.stream_protocol import StreamProtocol
+from serve_app.inference_protocol.statistics import REPORT
 from serve_app.runtime import haproxy
 from serve_app.runtime.launch import running
 from tests.support.clients.actions import BOARD
 from tests.support.clients.event_streams import listen
+from tests.support.clients.protocol_observations import observations, policy_of
+from tests.support.clients.triton import FORMS, Triton, assert_same
 from tests.support.leagues import tictactoe
-from tests.support.leagues.served_leagues import promote, publish
-from tests.support.policies.graphs import masked_mlp
+from tests.support.leagues.served_leagues import promote
+from tests.support.servers.protocol_servers import Address
 from tests.support.servers.scaling import scale
 from tests.support.servers.under_load import ACTION, RayServer, load, processes, serving
 from tests.support.waiting import until
@@ -56,7 +59,7 @@ def url(ray_server: RayServer) -> str:
     return ray_server.url
 
 
-def test_all_replicas_answer_with_their_name(url: str, served: Registry) -> None:
+def test_all_replicas_answer_with_their_name_and_report_for_all(url: str, served: Registry) -> None:
     promote(served, "board", 1)
     until(lambda: serving(served, 1) == 2)
     with httpx.Client(base_url=url) as client:
@@ -67,17 +70,21 @@ def test_all_replicas_answer_with_their_name(url: str, served: Registry) -> None
         def listed() -> set[str]:
             return {row["replica"] for row in client.get("/v1/leagues/board").json()["replicas"]}
 
+        def measured() -> set[str]:
+            return set(
+                re.findall(r'^league_request_seconds_count{.*replica="(.*?)"', client.get("/metrics").text, re.M)
+            )
+
         # One that another test has killed stays in the list for some seconds.
-        until(lambda: len(replicas := answering()) == 2 and replicas == listed())
+        until(lambda: len(replicas := answering()) == 2 and replicas == listed() <= measured())
         assert client.get("/v1/health/ready").status_code == 200
 
 
 def test_replicas_have_the_priority_of_the_server(served: Registry) -> None:
     """Ray lowers that of its workers by default: busy processes of the machine would take the CPU from replicas."""
     until(lambda: len(processes(served.storage, "PolicyServer")) == 2)  # one of them may be replaced
-    replicas = processes(served.storage, "PolicyServer")
-    own = os.getpriority(os.PRIO_PROCESS, 0)
-    assert {os.getpriority(os.PRIO_PROCESS, pid) for pid in replicas} == {own}
+    priorities = {os.getpriority(os.PRIO_PROCESS, pid) for pid in processes(served.storage, "PolicyServer")}
+    assert priorities == {os.getpriority(os.PRIO_PROCESS, 0)}
 
 
 @pytest.mark.e2e
@@ -100,8 +107,7 @@ def listeners(storage: Storage) -> set[tuple[str, str]]:
     return found
 
 
-@pytest.mark.parametrize("method", ["ListApplications", "Healthz"])
-def test_messages_to_ray_serve_itself_are_not_read(served: Registry, method: str) -> None:
+def test_messages_to_ray_serve_itself_are_not_read(served: Registry) -> None:
     """A call that only starts is answered, by replicas and by Serve's fallback proxy."""
     ends = threading.Event()
 
@@ -111,7 +117,7 @@ def test_messages_to_ray_serve_itself_are_not_read(served: Registry, method: str
 
     until(lambda: len(grpc_ports(served)) == 3)
     try:
-        for port in grpc_ports(served):
+        for port, method in product(grpc_ports(served), ("ListApplications", "Healthz")):
             with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
                 call = channel.stream_unary(f"/ray.serve.RayServeAPIService/{method}")
                 assert isinstance(call(never(), timeout=60), bytes)
@@ -128,19 +134,6 @@ def grpc_ports(registry: Registry) -> set[str]:
                     lines = Path(argument).read_text()
                     return set(re.findall(r"^ *server [^ ]* 127[.]0[.]0[.]1:(\d+) proto h2 check", lines, re.M))
     return set()
-
-
-def test_one_scrape_covers_all_replicas(url: str, served: Registry) -> None:
-    with httpx.Client(base_url=url) as client:
-        for _ in range(50):
-            client.post(ACTION, json={"observation": BOARD})
-
-        def replicas() -> set[str]:
-            lines = client.get("/metrics").text.splitlines()
-            found = [line for line in lines if line.startswith("league_request_seconds_count{")]
-            return {line.split('replica="')[1].split('"')[0] for line in found}
-
-        until(lambda: len(replicas()) == 2)
 
 
 def versions_of(url: str) -> Callable[[], Callable[[], int]]:
@@ -162,7 +155,7 @@ def versions_of(url: str) -> Callable[[], Callable[[], int]]:
 def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
     caller = versions_of(url)
     promote(served, "board", 1)
-    with load(caller, callers=4) as seen:
+    with load(caller, callers=4) as calls:
         for share in (1.0, 0.0, 1.0):
             canary, shadow = Portion(2, share), Portion(3, 1.0)
             setting = served.traffic.set("board", canary=canary, shadow=shadow, actor="test", reason="test")
@@ -170,8 +163,8 @@ def test_traffic_can_be_moved_under_load(url: str, served: Registry) -> None:
             assert caller()() == (2 if share else 1)
         off = served.traffic.set("board", canary=None, shadow=None, actor="test", reason="test")
         served.changes.wait_for_traffic(off, 30)
-    assert seen.failures == []
-    assert seen.versions.keys() == {1, 2}
+    assert calls.failures == []
+    assert calls.versions.keys() == {1, 2}
     until(lambda: [(one.candidate, one.failed) for one in served.traffic.shadow_counts("board")] == [(3, 0)])
 
 
@@ -179,7 +172,7 @@ def test_mixtures_are_swapped_under_load_and_pinned_in_every_replica(url: str, s
     promote(served, "board", 1)
     mixtures = [served.publisher.publish_mixture("board", shares) for shares in ({1: 0.3, 3: 0.7}, {2: 0.5, 3: 0.5})]
     # New connections, which reach any replica.
-    with httpx.Client(base_url=url, headers={"connection": "close"}) as client, load(versions_of(url), 4) as seen:
+    with httpx.Client(base_url=url, headers={"connection": "close"}) as client, load(versions_of(url), 4) as calls:
         for row in mixtures * 2:
             promote(served, "board", row.number)
             served.changes.wait_for_alias(served.aliases.history("board")[0], 30)
@@ -190,60 +183,38 @@ def test_mixtures_are_swapped_under_load_and_pinned_in_every_replica(url: str, s
                 assert reply.json()["version"] == member
         promote(served, "board", 1)
         served.changes.wait_for_alias(served.aliases.history("board")[0], 30)
-    assert seen.failures == []
-    assert seen.versions.keys() <= {1, 2, 3}
-
-
-def test_a_remote_policy_acts_as_the_graph(url: str, served: Registry) -> None:
-    random = np.random.default_rng(0)
-    mask = random.integers(0, 2, (50, 7), dtype=np.int8)
-    mask[:, 0] = 1
-    batch = {"observation": random.integers(0, 2, (50, 6, 7, 2), dtype=np.int8), "action_mask": mask}
-    expected = OnnxPolicy(masked_mlp(seed=1)).act(batch).actions
-    spaces = served.leagues.get("board").interface.of_policy("shared")
-    with closing(OpenInferencePolicy(RemoteRef(url, "board", "2"), "shared", spaces)) as policy:
-        np.testing.assert_array_equal(policy.act(batch).actions, expected)
+    assert calls.failures == []
+    assert calls.versions.keys() <= {1, 2, 3}
 
 
 @pytest.mark.e2e
 def test_promotions_under_load_lose_no_request(url: str, served: Registry) -> None:
-    def caller() -> Callable[[], int]:
-        client = httpx.Client(base_url=url)
-
-        def call() -> int:
-            reply = client.post(ACTION, json={"observation": BOARD})
-            assert reply.status_code == 200, reply.text
-            return int(reply.json()["version"])
-
-        return call
-
+    caller = versions_of(url)
     send_request = caller()
     promote(served, "board", 1)
     until(lambda: serving(served, 1) == 2)
-    with load(caller, callers=8) as seen:
+    with load(caller, callers=8) as calls:
         for version in (2, 3, 1) * 4:
             promote(served, "board", version)
             until(lambda version=version: serving(served, version) == 2)
             assert {send_request() for _ in range(4)} == {version}, "a replica answers with the previous version"
-    assert seen.failures == []
-    assert seen.versions.keys() == {1, 2, 3}
+    assert calls.failures == []
+    assert calls.versions.keys() == {1, 2, 3}
 
 
-@pytest.mark.parametrize(
-    "has_length", [True, pytest.param(False, marks=pytest.mark.e2e)], ids=["content length", "chunked"]
-)
-def test_a_body_of_a_hundred_megabytes_is_rejected(url: str, served: Registry, has_length: bool) -> None:
+@pytest.mark.e2e
+def test_a_body_of_a_hundred_megabytes_is_rejected(url: str, served: Registry) -> None:
     size, part = 100 * 2**20, b" " * 2**16
     until(lambda: len(peaks(served.storage)) == 2)
     peaks_before = peaks(served.storage)
-    headers = {"content-type": "application/json"} | ({"content-length": str(size)} if has_length else {})
-    with httpx.Client(base_url=url) as client:
-        try:
-            reply = client.post(ACTION, content=(part for _ in range(size // len(part))), headers=headers)
-        except httpx.WriteError:
-            pytest.fail("the connection was cut before the answer could be read")
-        assert (reply.status_code, reply.json()["code"]) == (413, "body_too_large")
-        assert client.post(ACTION, json={"observation": BOARD}).status_code == 200
+    with httpx.Client(base_url=url, headers={"content-type": "application/json"}) as client:
+        for length in ({}, {"content-length": str(size)}):
+            try:
+                reply = client.post(ACTION, content=(part for _ in range(size // len(part))), headers=length)
+            except httpx.WriteError:
+                pytest.fail("the connection was cut before the answer could be read")
+            assert (reply.status_code, reply.json()["code"]) == (413, "body_too_large")
+            assert client.post(ACTION, json={"observation": BOARD}).status_code == 200
     growth = [peak - peaks_before[pid] for pid, peak in peaks(served.storage).items()]
     assert max(growth) < 20 * 2**20
 
@@ -342,22 +313,6 @@ def close_codes() -> Iterator[list[int]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(StreamProtocol, "connection_lost", record)
         yield codes
-
-
-def test_a_tampered_champion_never_answers(url: str, served: Registry) -> None:
-    promote(served, "board", 1)
-    until(lambda: serving(served, 1) >= 2)
-    new = publish(served, "board", {"shared": masked_mlp(seed=8)}, "run/new").number
-    graph = served.artifacts.path("board", new) / "shared.onnx"
-    content = graph.read_bytes()
-    graph.write_bytes(masked_mlp(seed=9))
-    promote(served, "board", new)
-    with httpx.Client(base_url=url) as client:
-        until(lambda: client.get("/v1/leagues/board").json()["faults"])
-        for _ in range(20):
-            assert client.post(ACTION, json={"observation": BOARD}).json()["version"] == 1
-        graph.write_bytes(content)
-        until(lambda: serving(served, new) >= 2)
 
 
 @pytest.fixture(scope="module")
@@ -477,16 +432,6 @@ def retry_until_ready(send_request: Callable[[], httpx.Response]) -> httpx.Respo
     return replies[-1]
 
 
-def test_a_recorded_game_is_shown_and_rendered_as_video(evaluator: httpx.Client, served: Registry) -> None:
-    evaluate(tictactoe.LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=served, blocks=1)
-    match = Ledger(served).matches(league=tictactoe.LEAGUE)[-1]
-    game = f"/v1/leagues/tictactoe/matches/{match.id}/games/1"
-    document = retry_until_ready(lambda: evaluator.get(game)).json()
-    actions = [move["action"] for step in document["steps"] for move in step["moves"]]
-    assert actions == [*match.games[1].opening, *match.games[1].actions]
-    assert retry_until_ready(lambda: evaluator.get(f"{game}/video.gif")).content[:6] == b"GIF89a"
-
-
 def test_a_game_survives_the_death_of_any_process(evaluator: httpx.Client, served: Registry) -> None:
     body: dict[str, Any] = {"opponent": "tictactoe@2", "agent": "player_1", "chances": True, "actions": []}
 
@@ -501,9 +446,12 @@ def test_a_game_survives_the_death_of_any_process(evaluator: httpx.Client, serve
     service = only_process(served.storage, ":EvaluationService")
     os.kill(service, signal.SIGKILL)
     document = move()
-    assert [each["moves"][0]["action"] for each in document["steps"][1::2]] == body["actions"]
+    assert [step["moves"][0]["action"] for step in document["steps"][1::2]] == body["actions"]
     until(lambda: service not in processes(served.storage, ":EvaluationService"))
     only_process(served.storage, "evaluation.service.game_worker")  # that of the killed service ends
+    evaluate(tictactoe.LEAGUE, ["tictactoe@1", "tictactoe@2"], registry=served, blocks=1)
+    video = f"/v1/leagues/tictactoe/matches/{Ledger(served).matches(league=tictactoe.LEAGUE)[-1].id}/games/1/video.gif"
+    assert retry_until_ready(lambda: evaluator.get(video)).content[:6] == b"GIF89a"
     rejected = evaluator.post("/v1/leagues/tictactoe/play", json=body | {"actions": [9]})
     assert (rejected.status_code, rejected.json()["code"]) == (422, "illegal_action")
     assert "Traceback" not in rejected.text
@@ -553,3 +501,84 @@ def launcher(port: int) -> int:
             if any(f'"port": {port}' in argument for argument in child.cmdline()):
                 return child.pid
     raise AssertionError(f"no process serves on port {port}")
+
+
+@pytest.fixture(scope="module")
+def address(ray_server: RayServer) -> Address:
+    promote(ray_server.registry, "board", 1)
+    until(lambda: serving(ray_server.registry, 1) >= 2)
+    return Address(ray_server.url.removeprefix("http://"), ray_server.grpc)
+
+
+@pytest.mark.e2e
+def test_each_form_of_the_client_is_answered(address: Address, served: Registry) -> None:
+    for model in ("board", "pistons", "chess", "vector", "choice"):
+        policy, signature = policy_of(served.storage, model)
+        arrays = observations(signature, 4)
+        for form in FORMS:
+            with Triton(form, address) as triton:
+                assert triton.call("is_server_live"), form
+                assert triton.call("is_server_ready"), form
+                assert triton.call("is_model_ready", model, "champion"), (model, form)
+                assert_same(triton.infer(model, arrays).as_numpy("action"), policy.act(arrays).actions)
+
+
+def wait_for_both_replicas(triton: Triton, served: Registry) -> None:
+    """Both report to the registry that they have answered on one channel: HAProxy balances calls, not connections."""
+
+    def have_answered() -> bool:
+        for _ in range(4):
+            triton.infer("vector", {"observation": np.zeros((1, 2), np.float32)})
+        reports = served.replicas.reports().values()
+        return sum(any(entry["name"] == "vector" for entry in report[REPORT]) for report in reports) == 2
+
+    until(have_answered)
+
+
+@pytest.mark.parametrize("form", ["http", "grpc"])
+def test_all_replicas_report_the_sum_of_their_statistics(address: Address, form: str) -> None:
+    """Soon after the last request, each answers with the number of requests that clients sent."""
+    calls = 20
+    with Triton(form, address) as triton:
+
+        def counts() -> set[int]:
+            """From as many calls as reach both replicas."""
+            entries = [triton.document("get_inference_statistics", "choice", "1")["model_stats"][0] for _ in range(8)]
+            return {int(entry["inference_stats"]["success"].get("count", 0)) for entry in entries}
+
+        until(lambda: len(counts()) == 1)
+        (before,) = counts()
+        for _ in range(calls):
+            triton.infer("choice", {"observation": np.zeros(1, np.int64)})
+        until(lambda: counts() == {before + calls})
+
+
+@pytest.mark.e2e
+def test_retried_calls_survive_the_death_of_a_replica(address: Address, served: Registry) -> None:
+    arrays = {"observation": np.zeros((1, 2), np.float32)}
+    with Triton("grpc", address) as triton:
+        wait_for_both_replicas(triton, served)
+    victim = processes(served.storage, "PolicyServer")[0]
+
+    def caller() -> Callable[[], int]:
+        client = tritonclient.grpc.InferenceServerClient(address.grpc)
+        tensor = tritonclient.grpc.InferInput("observation", [1, 2], "FP32")
+        tensor.set_data_from_numpy(arrays["observation"])
+
+        def call() -> int:
+            for _ in range(3):
+                try:
+                    return int(client.infer("vector", [tensor]).get_response().model_version)
+                except InferenceServerException as error:
+                    failure = error
+            raise failure
+
+        return call
+
+    with load(caller, callers=4) as calls:
+        until(lambda: calls.versions.total() > 200)
+        os.kill(victim, signal.SIGKILL)
+        after = calls.versions.total()
+        until(lambda: calls.versions.total() > after + 1000)
+    assert calls.failures == []
+    until(lambda: len(set(processes(served.storage, "PolicyServer")) - {victim}) == 2)

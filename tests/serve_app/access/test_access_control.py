@@ -1,4 +1,8 @@
-"""Authentication and authorization of requests in all protocols, and their error messages."""
+"""Keys, permissions and origins of requests in all protocols, their error responses, and the access log.
+
+Pages of other sites cannot change anything, even if no key is required; programs and our own pages can.
+A server without keys on loopback answers only requests that name it so.
+"""
 
 import asyncio
 import json
@@ -7,28 +11,40 @@ from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock, Mock
 
 import httpx
 import pytest
+from starlette.applications import Starlette
+from starlette.routing import Route, WebSocketRoute
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.types import Message
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
-from league.errors import Overloaded
+from league import errors as league_errors
+from league.errors import LeagueError, Overloaded, StorageError
 from league.registry.registry import Registry
 from league.settings import Storage
-from serve_app.access import api_keys
+from serve_app.access import api_keys, errors, permissions
 from serve_app.access.api_keys import TokenBucket
+from serve_app.access.errors import CrossSiteRequest, ErrorHandlers, UntrustedHost
 from serve_app.access.load_shedding import Backlog
+from serve_app.access.permissions import PUBLIC, Permissions, RequiredPermission, for_rpc
+from serve_app.access.request_origin import reject_cross_site, reject_foreign_host
 from serve_app.app import Replica
 from serve_app.codecs.request_limits import LARGE_BODY
+from serve_app.routes.table import ROUTES
 from serve_app.runtime.haproxy_script import KEY_ACCEPTED
 from serve_app.runtime.replica_process import this_process
 from serve_app.settings import ServeSettings
-from tests.support.clients.actions import BOARD
-from tests.support.leagues.served_leagues import everything
-from tests.support.servers.replicas import LOCALHOST, QUICK, local_client
+from tests.support.clients.actions import BOARD, act, board_arrays, inference
+from tests.support.servers.replicas import LOCALHOST, QUICK, local_client, replica
+from tests.support.servers.streaming import listening
 from tests.support.waiting import until
 
 ACTION = "/v1/policies/board/action"
@@ -58,15 +74,12 @@ def assert_rejected(reply: httpx.Response, status: int, code: str, *words: str) 
         assert word in reply.json()["message"]
 
 
-def test_without_keys_a_server_on_loopback_is_open(client: TestClient) -> None:
-    assert client.post(ACTION, json=BODY).status_code == 200
-    assert client.get("/v1/leagues").status_code == 200
-    assert client.post(ACTION, json=BODY, headers=bearer("whatever")).status_code == 200
-
-
 def test_the_first_key_locks_the_server_and_its_revocation_does_not_unlock_it(
     client: TestClient, registry: Registry
 ) -> None:
+    for headers in ({}, bearer("whatever")):
+        assert client.post(ACTION, json=BODY, headers=headers).status_code == 200
+    assert client.get("/v1/leagues").status_code == 200
     _, token = registry.keys.create("bot", ["act"])
     until(lambda: client.post(ACTION, json=BODY).status_code == 401)
     reply = client.post(ACTION, json=BODY)
@@ -99,11 +112,11 @@ def test_haproxy_is_told_that_a_key_was_accepted(registry: Registry) -> None:
         assert KEY_ACCEPTED not in client.post(ACTION, json=BODY, headers=bearer("x" * 47)).headers
 
 
-@pytest.mark.parametrize("path", ["/", "/docs", "/openapi.json", "/v1/leagues", "/v1/nothing", "/v2", "/metrics", "/?"])
-def test_browsers_do_not_guess_the_type_of_a_response(read_only_client: TestClient, path: str) -> None:
-    for method in ("GET", "POST", "HEAD"):
-        response = read_only_client.request(method, path)
-        assert response.headers.get_list("x-content-type-options") == ["nosniff"], (method, response.status_code)
+def test_browsers_do_not_guess_the_type_of_a_response(read_only_client: TestClient) -> None:
+    for path in ("/", "/docs", "/openapi.json", "/v1/leagues", "/v1/nothing", "/v2", "/metrics", "/?"):
+        for method in ("GET", "POST", "HEAD"):
+            response = read_only_client.request(method, path)
+            assert response.headers.get_list("x-content-type-options") == ["nosniff"], (method, path)
 
 
 def test_an_error_of_ours_has_the_headers_of_a_response(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,33 +128,24 @@ def test_an_error_of_ours_has_the_headers_of_a_response(storage: Storage, monkey
     assert (response.status_code, response.headers["x-content-type-options"]) == (500, "nosniff")
 
 
-def test_health_routes_need_no_key(registry: Registry) -> None:
-    with serving_replica(registry, require_keys="always") as client:
-        for path in ("/v1/health/live", "/v1/health/ready", "/v2/health/live", "/v2/health/ready"):
-            assert client.get(path).status_code == 200
-        assert_rejected(client.get("/v1/leagues"), 401, "unauthenticated", "league keys create NAME --scope read")
+def test_whether_keys_are_required(registry: Registry) -> None:
+    """Not for health routes."""
 
+    def statuses(require_keys: str, is_exposed: bool) -> list[int]:
+        with serving_replica(registry, is_exposed, require_keys=require_keys) as client:
+            for path in ("/v1/health/live", "/v1/health/ready", "/v2/health/live", "/v2/health/ready"):
+                assert client.get(path).status_code == 200
+            if (reply := client.get("/v1/leagues")).status_code != 200:
+                assert_rejected(reply, 401, "unauthenticated", "league keys create NAME --scope read")
+            return [client.post(ACTION, json=BODY).status_code, client.get("/v2/models/board").status_code]
 
-@pytest.mark.parametrize(
-    ("require_keys", "is_exposed", "status"),
-    [("auto", False, 200), ("auto", True, 401), ("always", False, 401), ("never", True, 200)],
-)
-def test_whether_keys_are_required_before_one_exists(
-    registry: Registry, require_keys: str, is_exposed: bool, status: int
-) -> None:
-    with serving_replica(registry, is_exposed, require_keys=require_keys) as client:
-        assert client.post(ACTION, json=BODY).status_code == status
-        assert client.get("/v2/models/board").status_code == status
-
-
-def test_keys_are_never_required_with_never(registry: Registry) -> None:
+    assert statuses("auto", is_exposed=False) == statuses("never", is_exposed=True) == [200, 200]
+    assert statuses("auto", is_exposed=True) == statuses("always", is_exposed=False) == [401, 401]
     registry.keys.create("bot", ["act"])
-    with serving_replica(registry, require_keys="never") as client:
-        assert client.post(ACTION, json=BODY).status_code == 200
+    assert statuses("never", is_exposed=False) == [200, 200]
 
 
-@pytest.mark.parametrize("header", ["authorization", "x-api-key"])
-def test_a_key_is_limited_to_its_scope(registry: Registry, header: str) -> None:
+def test_a_key_is_limited_to_its_scope(registry: Registry) -> None:
     tokens = {scope: registry.keys.create(scope, [scope])[1] for scope in ("act", "read", "promote")}
     calls: dict[str, tuple[str, str]] = {
         "act": ("POST", ACTION),
@@ -150,8 +154,9 @@ def test_a_key_is_limited_to_its_scope(registry: Registry, header: str) -> None:
     }
     with serving_replica(registry) as client:
         for scope, token in tokens.items():
-            shown = {header: f"bEARER {token}" if header == "authorization" else token}
-            for needed, (method, path) in calls.items():
+            for (needed, (method, path)), shown in product(
+                calls.items(), ({"x-api-key": token}, {"authorization": f"bEARER {token}"})
+            ):
                 reply = client.request(method, path, json=BODY if needed == "act" else {}, headers=shown)
                 if scope != needed:
                     assert_rejected(reply, 403, "forbidden", f"scope {needed}", f"the key {scope} has {scope}")
@@ -187,33 +192,22 @@ def test_a_key_expires_without_a_registry_change(registry: Registry, monkeypatch
             assert client.post(ACTION, json=BODY, headers=bearer(token)).status_code == status
 
 
-@pytest.mark.usefixtures("_stopped_clock")
-def test_a_rate_limit_is_enforced(registry: Registry) -> None:
-    tokens = [registry.keys.create(name, ["act"], rate=rate)[1] for name, rate in (("slow", 0.5), ("fast", None))]
+def test_a_rate_limit_is_enforced(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A large body counts as several requests."""
+    monkeypatch.setattr(api_keys, "TokenBucket", partial(TokenBucket, clock=lambda: 0.0))  # no time passes
+    rates = {"slow": 0.5, "large": 0.5, "fast": None}
+    tokens = {name: registry.keys.create(name, ["act"], rate=rate)[1] for name, rate in rates.items()}
+    large = json.dumps(BODY).encode() + b" " * LARGE_BODY
     with serving_replica(registry) as client:
-        assert client.post(ACTION, json=BODY, headers=bearer(tokens[0])).status_code == 200
-        reply = client.post(ACTION, json=BODY, headers=bearer(tokens[0]))
-        assert_rejected(reply, 429, "rate_limited", "rate limit exceeded: the key slow allows 0.5 requests per second")
-        assert reply.headers["retry-after"] == "2"
+        assert client.post(ACTION, json=BODY, headers=bearer(tokens["slow"])).status_code == 200
+        assert client.post(ACTION, content=large, headers=bearer(tokens["large"])).status_code == 413
+        for name, seconds in (("slow", "2"), ("large", "4")):
+            reply = client.post(ACTION, json=BODY, headers=bearer(tokens[name]))
+            message = f"rate limit exceeded: the key {name} allows 0.5 requests per second"
+            assert_rejected(reply, 429, "rate_limited", message)
+            assert reply.headers["retry-after"] == seconds
         for _ in range(20):
-            assert client.post(ACTION, json=BODY, headers=bearer(tokens[1])).status_code == 200
-
-
-@pytest.fixture
-def _stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keys get no tokens back, however long a test takes."""
-    monkeypatch.setattr(api_keys, "TokenBucket", partial(TokenBucket, clock=lambda: 0.0))
-
-
-@pytest.mark.usefixtures("_stopped_clock")
-def test_a_large_body_counts_as_several_requests(registry: Registry) -> None:
-    _, token = registry.keys.create("slow", ["act"], rate=0.5)
-    with serving_replica(registry) as client:
-        large = json.dumps(BODY).encode() + b" " * LARGE_BODY
-        assert client.post(ACTION, content=large, headers=bearer(token)).status_code == 413
-        reply = client.post(ACTION, json=BODY, headers=bearer(token))
-        assert_rejected(reply, 429, "rate_limited", "the key slow allows 0.5 requests per second")
-        assert reply.headers["retry-after"] == "4"
+            assert client.post(ACTION, json=BODY, headers=bearer(tokens["fast"])).status_code == 200
 
 
 @pytest.mark.parametrize(("is_late", "admissions"), [(False, 1), (True, 2)])
@@ -221,18 +215,14 @@ def test_a_body_that_arrives_late_is_admitted_like_a_request(
     registry: Registry, monkeypatch: pytest.MonkeyPatch, is_late: bool, admissions: int
 ) -> None:
     """Otherwise clients could open many requests, and send all bodies at the same time."""
-    server, sent = Replica(Registry.open(registry.storage), QUICK, "replica-1"), []
-    admitted: list[None] = []
-    admit = Backlog.admit
-    monkeypatch.setattr(Backlog, "admit", lambda backlog: admitted.append(admit(backlog)))
+    server, send = Replica(Registry.open(registry.storage), QUICK, "replica-1"), AsyncMock()
+    admit = Mock(side_effect=Backlog.admit)
+    monkeypatch.setattr(Backlog, "admit", lambda backlog: admit(backlog))
 
     async def receive() -> Message:
         for _ in range(3 * is_late):
             await asyncio.sleep(0)
         return {"type": "http.request", "body": json.dumps(BODY).encode()}
-
-    async def send(message: Message) -> None:
-        sent.append(message)
 
     scope = {"type": "http", "method": "POST", "headers": [], "query_string": b"", "path_params": {"model": "board"}}
 
@@ -243,20 +233,17 @@ def test_a_body_that_arrives_late_is_admitted_like_a_request(
     with local_client(server) as client:
         assert client.portal is not None
         client.portal.call(call)
-    assert (sent[0]["status"], len(admitted)) == (200, admissions)
+    assert (send.await_args_list[0].args[0]["status"], admit.call_count) == (200, admissions)
 
 
 def test_a_rejected_stream_has_an_error_response(registry: Registry) -> None:
     _, token = registry.keys.create("bot", ["read"])
     with serving_replica(registry) as client:
-        for headers, status in (({}, 401), (bearer(token), 403)):
-            with (
-                pytest.raises(WebSocketDenialResponse) as caught,
-                client.websocket_connect("/v1/policies/board/stream", headers=headers),
-            ):
+        for headers, status, code in (({}, 401, "unauthenticated"), (bearer(token), 403, "forbidden")):
+            stream = client.websocket_connect("/v1/policies/board/stream", headers=headers)
+            with pytest.raises(WebSocketDenialResponse) as caught, stream:
                 pass
-            assert caught.value.status_code == status
-            assert caught.value.json()["code"] in ("unauthenticated", "forbidden")
+            assert (caught.value.status_code, caught.value.json()["code"]) == (status, code)
 
 
 def test_known_keys_are_valid_while_the_database_is_unreachable(registry: Registry) -> None:
@@ -270,41 +257,19 @@ def test_known_keys_are_valid_while_the_database_is_unreachable(registry: Regist
         registry.storage.home.with_name("elsewhere").rename(registry.storage.home)
 
 
-def test_a_registry_without_its_keys_does_not_unlock_the_server(
-    registry: Registry, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    registry.keys.create("bot", ["act"])
-    Registry.open(Storage.at(tmp_path / "other")).close()
-    with serving_replica(registry) as client:
-        registry.storage.home.rename(tmp_path / "away")
-        (tmp_path / "other").rename(registry.storage.home)
-        until(lambda: "it is a different database" in caplog.text)
-        assert client.post(ACTION, json=BODY).status_code == 401
+def test_a_persistent_queue_is_shed(read_only_client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Backlog, "admit", Mock(side_effect=Overloaded("more than 64 requests wait here already")))
+    for path in (ACTION, "/v2/models/board/infer"):
+        reply = read_only_client.post(path, json=BODY)
+        assert (reply.status_code, reply.headers["retry-after"]) == (429, "1")
+    assert read_only_client.get("/v1/leagues").status_code == 200, "only actions are shed"
 
 
-def test_a_persistent_queue_is_shed(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    server = Replica(Registry.open(registry.storage), QUICK, "replica-1")
-
-    def full() -> None:
-        raise Overloaded("more than 64 requests wait here already")
-
-    with local_client(server) as client:
-        monkeypatch.setattr(type(server.access.backlog), "admit", lambda _: full())
-        for path in (ACTION, "/v2/models/board/infer"):
-            reply = client.post(path, json=BODY)
-            assert (reply.status_code, reply.headers["retry-after"]) == (429, "1")
-        assert client.get("/v1/leagues").status_code == 200, "only actions are shed"
-
-
-@pytest.mark.parametrize("value", ["", "0", "-5", "1.5", "soon", "9" * 30, "٣"])
-def test_an_invalid_time_limit_is_rejected(read_only_client: TestClient, value: str) -> None:
-    headers = [(b"x-request-timeout-ms", value.encode())]
-    assert_rejected(
-        read_only_client.post(ACTION, json=BODY, headers=headers), 400, "invalid_input", "x-request-timeout-ms"
-    )  # type: ignore[arg-type]
-
-
-def test_a_sufficient_time_limit_changes_nothing(read_only_client: TestClient) -> None:
+def test_an_invalid_time_limit_is_rejected(read_only_client: TestClient) -> None:
+    for value in ("", "0", "-5", "1.5", "soon", "9" * 30, "٣"):
+        headers: Any = [(b"x-request-timeout-ms", value.encode())]
+        reply = read_only_client.post(ACTION, json=BODY, headers=headers)
+        assert_rejected(reply, 400, "invalid_input", "x-request-timeout-ms")
     assert read_only_client.post(ACTION, json=BODY, headers={"x-request-timeout-ms": "4000"}).status_code == 200
 
 
@@ -313,8 +278,7 @@ IMPATIENT = ServeSettings.model_validate(QUICK.model_dump() | {"timeout": 0.05, 
 
 
 @pytest.mark.anyio
-async def test_a_response_that_is_not_read_is_not_started_twice(tmp_path: Path) -> None:
-    registry = everything(Storage.at(tmp_path / "home"))
+async def test_a_response_that_is_not_read_is_not_started_twice(registry: Registry) -> None:
     server = Replica(registry, IMPATIENT, "replica-1")
     application = server.application()
     sent: list[str] = []
@@ -335,9 +299,7 @@ async def test_a_response_that_is_not_read_is_not_started_twice(tmp_path: Path) 
 
 
 @pytest.mark.anyio
-@pytest.mark.parametrize("path", [ACTION, "/v2/models/board/infer"])
-async def test_a_body_that_does_not_arrive_times_out(tmp_path: Path, path: str) -> None:
-    registry = everything(Storage.at(tmp_path / "home"))
+async def test_a_body_that_does_not_arrive_times_out(registry: Registry) -> None:
     server = Replica(registry, IMPATIENT, "replica-1")
     application = server.application()
 
@@ -348,8 +310,9 @@ async def test_a_body_that_does_not_arrive_times_out(tmp_path: Path, path: str) 
     async with application.router.lifespan_context(application):
         transport = httpx.ASGITransport(app=application)
         async with httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
-            reply = await client.post(path, content=slow_body())
-            assert (reply.status_code, reply.headers["connection"]) == (408, "close")
+            for path in (ACTION, "/v2/models/board/infer"):
+                reply = await client.post(path, content=slow_body())
+                assert (reply.status_code, reply.headers["connection"]) == (408, "close")
             assert (await client.post(ACTION, json=BODY)).status_code == 200
     assert server.action.in_flight == 0
 
@@ -357,10 +320,9 @@ async def test_a_body_that_does_not_arrive_times_out(tmp_path: Path, path: str) 
 @pytest.mark.anyio
 @pytest.mark.parametrize(("limit", "requested"), [(4.5, "50"), (0.05, "60000")], ids=["requested", "of the server"])
 async def test_a_slow_response_times_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: float, requested: str
+    registry: Registry, monkeypatch: pytest.MonkeyPatch, limit: float, requested: str
 ) -> None:
     """A client can only shorten the timeout of the server."""
-    registry = everything(Storage.at(tmp_path / "home"))
     server = Replica(registry, ServeSettings.model_validate(QUICK.model_dump() | {"timeout": limit}), "replica-1")
     application = server.application()
 
@@ -373,3 +335,338 @@ async def test_a_slow_response_times_out(
         async with httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
             reply = await client.post(ACTION, json=BODY, headers={"x-request-timeout-ms": requested})
             assert_rejected(reply, 504, "deadline_exceeded", "0.05 s")
+
+
+LOGGING_SETTINGS = QUICK.model_copy(update={"access_log": "logs"})
+
+
+@pytest.fixture
+def log(registry: Registry) -> Path:
+    return registry.storage.home / "logs" / "access-replica-1.jsonl"
+
+
+def lines(log: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in log.read_text().splitlines()]
+
+
+def test_each_request_is_a_line(registry: Registry, log: Path) -> None:
+    _, token = registry.keys.create("game-server", ["act"])
+    with replica(registry.storage, LOGGING_SETTINGS) as client:
+        client.headers.update(bearer(token))
+        act(client, version=2, observation=BOARD)
+        client.post("/v2/models/board/versions/3/infer", json=inference(board_arrays([BOARD])))
+        client.post(ACTION, json={})
+        client.get("/v1/leagues")
+        client.post(ACTION, headers=bearer("nothing"))
+        client.get("/v1/health/live")
+    found = lines(log)
+    assert [[line[name] for name in ("method", "route", "policy", "version", "status", "key")] for line in found] == [
+        ["POST", ACTION, "board", 2, 200, "game-server"],
+        ["POST", "/v2/models/board/versions/3/infer", "board", 3, 200, "game-server"],
+        ["POST", ACTION, None, None, 400, "game-server"],
+        ["GET", "/v1/leagues", None, None, 403, None],
+        ["POST", ACTION, None, None, 401, None],
+        ["GET", "/v1/health/live", None, None, 200, None],
+    ]
+    assert all(line["us"] > 0 and line["time"].endswith("Z") for line in found)
+    assert token not in log.read_text()
+
+
+def test_requests_succeed_if_the_log_cannot_be_written(registry: Registry, log: Path) -> None:
+    log.parent.write_text("a file where the directory should be")
+    with replica(registry.storage, LOGGING_SETTINGS) as client:
+        for _ in range(3):
+            act(client, observation=BOARD)
+    log.parent.unlink()
+    with replica(registry.storage) as client:
+        act(client, observation=BOARD)
+    assert not log.exists(), "by default nothing is logged"
+
+
+ERRORS = [
+    error
+    for module in (league_errors, errors)
+    for error in vars(module).values()
+    if isinstance(error, type) and issubclass(error, LeagueError)
+]
+EXPECTED = {
+    "BodyTooLarge": 413,
+    "UnsupportedMediaType": 415,
+    "IllegalAction": 422,
+    "Overloaded": 429,
+    "InvalidInput": 400,
+    "VersionRetired": 410,
+    "NotFound": 404,
+    "Conflict": 409,
+    "NotReady": 503,
+    "StorageError": 503,
+    "GameHung": 504,
+}
+
+
+def answer(error: Exception) -> tuple[int, dict[str, str], dict[str, str]]:
+    handlers = ErrorHandlers(retry=3, count=lambda *_: None).handlers()
+    app = Starlette(routes=[Route("/", AsyncMock(side_effect=error))], exception_handlers=handlers)
+    reply = TestClient(app, raise_server_exceptions=False).get("/")
+    return reply.status_code, reply.json(), dict(reply.headers)
+
+
+def test_an_error_has_the_status_of_its_class(subtests: pytest.Subtests) -> None:
+    for error in ERRORS:
+        with subtests.test(error.__name__):
+            status, body, headers = answer(error("a sentence"))
+            assert body == {"code": error.code, "message": error("a sentence").public_message}
+            assert ("retry-after" in headers) == (status in (429, 503))
+            known = [EXPECTED[ancestor.__name__] for ancestor in error.__mro__ if ancestor.__name__ in EXPECTED]
+            assert known[:1] in ([], [status])
+
+
+def test_paths_hosts_and_unexpected_exceptions_are_only_logged() -> None:
+    error = StorageError("the database postgresql://admin@db.internal/league cannot be used: no route to host")
+    message = "the registry's database or files cannot be used; see the server log"
+    assert answer(error)[1] == {"code": "storage_error", "message": message}
+    status, body, _ = answer(ZeroDivisionError("secret"))
+    assert (status, body["code"], "secret" in body["message"]) == (500, "internal_error", False)
+
+
+PERMISSIONS = Permissions(ROUTES)
+for_request = PERMISSIONS.for_request
+needs = RequiredPermission
+
+
+READ_ALL, CHANGE_ALL = needs("read", None, True), needs("promote", None, True)
+REQUESTS = (
+    ("POST", "/v1/policies/board/action", needs("act", "board")),
+    ("POST", "/v1/policies/duo.left/action", needs("act", "duo")),
+    ("GET", "/v1/policies/board", needs("read", "board")),
+    ("POST", "/v2/models/duo.left/infer", needs("act", "duo")),
+    ("POST", "/v2/models/board/versions/3/infer", needs("act", "board")),
+    ("GET", "/v2/models/board/versions/3/stats", needs("read", "board")),
+    ("GET", "/v2/models/stats", READ_ALL),
+    ("POST", "/v2/repository/index", READ_ALL),
+    ("GET", "/v2", needs("read", None)),
+    ("GET", "/docs", PUBLIC),
+    ("HEAD", "/openapi.json", PUBLIC),
+    ("POST", "/docs", CHANGE_ALL),
+    ("GET", "/docs/elsewhere", READ_ALL),
+    ("GET", "/", PUBLIC),
+    ("GET", "/leagues/board/verdicts", PUBLIC),
+    ("HEAD", "/pages/app.js", PUBLIC),
+    ("POST", "/leagues/board", CHANGE_ALL),
+    ("GET", "/leaguesque", READ_ALL),
+    ("GET", "/v1/leagues", READ_ALL),
+    ("PUT", "/v1/leagues/board/versions/3/note", needs("promote", "board", is_change=True)),
+    ("HEAD", "/v1/leagues/board", needs("read", "board")),
+    ("POST", "/v1/leagues/board/aliases/champion", needs("promote", "board", is_change=True)),
+    ("POST", "/v1/leagues/board/rollback", needs("promote", "board", is_change=True)),
+    ("POST", "/v1/leagues/board/evaluations", needs("evaluate", "board", is_change=True)),
+    ("DELETE", "/v1/leagues/board/evaluations/3", needs("evaluate", "board", is_change=True)),
+    ("PUT", "/v1/leagues/board/evaluations/3", needs("promote", "board")),
+    ("POST", "/v1/leagues/board/play", needs("act", "board")),
+    ("PUT", "/v1/leagues/board/play", needs("promote", "board")),
+    ("POST", "/v1/leagues/play", needs("promote", "play")),
+    ("GET", "/v1/leagues/board/matches/s/3/games/0/video.gif", needs("read", "board")),
+    ("GET", "/v1/leagues/board/evaluations/3/events", needs("read", "board", is_stream=True)),
+    ("GET", "/v1/leagues/board/events", needs("read", "board", is_stream=True)),
+    ("POST", "/v1/leagues/board/verdicts/won", needs("promote", "board")),
+    ("POST", "/v1/leagues/evaluations", needs("promote", "evaluations")),
+    ("GET", "/v1/health/ready", PUBLIC),
+    ("GET", "/v2/health/live", PUBLIC),
+    ("GET", "/v1/key", PUBLIC),
+    ("POST", "/v1/key", CHANGE_ALL),
+    ("POST", "/v2/health/live", CHANGE_ALL),
+    ("GET", "/anything", READ_ALL),
+    ("DELETE", "/v1/leagues/board", needs("promote", "board")),
+    ("POST", "//v1/leagues/board/rollback", CHANGE_ALL),
+    ("POST", "", CHANGE_ALL),
+)
+
+
+def test_permissions_of_requests(subtests: pytest.Subtests) -> None:
+    for method, path, need in REQUESTS:
+        with subtests.test(f"{method} {path}"):
+            assert for_request("http", method, path) == need
+    assert for_request("websocket", "GET", "/v1/policies/board/stream") == needs("act", "board")
+    assert for_request("websocket", "GET", "/elsewhere") == needs("act", None, True)
+    for rpc, model, need in (
+        ("ServerLive", "", PUBLIC),
+        ("ServerReady", "", PUBLIC),
+        ("ServerMetadata", "", needs("read", None)),
+        ("ModelReady", "board", needs("read", "board")),
+        ("ModelInfer", "duo.left", needs("act", "duo")),
+        ("ModelStatistics", "", READ_ALL),
+        ("RepositoryIndex", "", READ_ALL),
+    ):
+        assert for_rpc(rpc, model) == need, rpc
+
+
+def test_all_routes_but_health_documentation_and_pages_need_a_permission(registry: Registry) -> None:
+    for route in Replica(registry, QUICK, "replica-1").application().routes:
+        assert isinstance(route, Route | WebSocketRoute), "add the permissions of mounted applications"
+        kind = "websocket" if isinstance(route, WebSocketRoute) else "http"
+        for method in getattr(route, "methods", None) or ("GET",):
+            need = for_request(kind, method, route.path.replace("{", "").replace("}", ""))
+            is_page = not getattr(route, "include_in_schema", True)
+            is_open = is_page or "/health/" in route.path or route.path in ("/docs", "/openapi.json", "/v1/key")
+            assert (need.scope is None) == is_open, route.path
+            if "{league}" in route.path or "{model}" in route.path:
+                assert need.league in ("league", "model"), route.path
+
+
+def test_long_paths_and_models_are_not_cached() -> None:
+    """They come from requests without a key, too: 4096 of them would keep gigabytes."""
+    sizes = [cached.cache_info().currsize for cached in (PERMISSIONS._cached, permissions._for_rpc)]
+    path, model = f"/v1/leagues/{'x' * 300}", "x" * 300
+    assert for_request("http", "GET", path) == needs("read", "x" * 300)
+    assert for_rpc("ModelReady", model) == needs("read", model)
+    assert [cached.cache_info().currsize for cached in (PERMISSIONS._cached, permissions._for_rpc)] == sizes
+
+
+HOST = "127.0.0.1:8000"
+
+SAME_SITE = [
+    {},
+    {"sec-fetch-site": "same-origin", "origin": f"http://{HOST}"},
+    {"sec-fetch-site": "same-origin", "origin": "https://what.a.proxy.calls.itself"},
+    {"sec-fetch-site": "none"},
+    {"origin": f"http://{HOST}"},
+    {"origin": f"https://{HOST}"},
+]
+CROSS_SITE = [
+    {"sec-fetch-site": "cross-site", "origin": "https://evil.example"},
+    {"sec-fetch-site": "cross-site"},
+    {"sec-fetch-site": "same-site", "origin": "http://127.0.0.1:3000"},
+    {"sec-fetch-site": "", "origin": f"http://{HOST}"},
+    {"sec-fetch-site": "cross-site", "origin": f"http://{HOST}"},
+    {"origin": "https://evil.example"},
+    {"origin": "http://127.0.0.1:3000"},
+    {"origin": f"http://{HOST}.evil.example"},
+    {"origin": f"http://evil.example/{HOST}"},
+    {"origin": "null"},
+    {"origin": ""},
+]
+
+
+def encoded(headers: dict[str, str]) -> list[tuple[bytes, bytes]]:
+    return [(name.encode(), value.encode()) for name, value in (headers | {"host": HOST}).items()]
+
+
+def test_other_pages_can_only_read(subtests: pytest.Subtests) -> None:
+    changes = [("http", method) for method in ("POST", "DELETE", "PUT", "OPTIONS")] + [("websocket", "GET")]
+    for headers in SAME_SITE:
+        with subtests.test("same site", headers=headers):
+            for kind, method in changes:
+                reject_cross_site(kind, method, encoded(headers))
+    for headers in CROSS_SITE:
+        with subtests.test("cross-site", headers=headers):
+            for kind, method in changes:
+                with pytest.raises(CrossSiteRequest):
+                    reject_cross_site(kind, method, encoded(headers))
+            for method in ("GET", "HEAD"):
+                reject_cross_site("http", method, encoded(headers))
+
+
+def test_each_route_rejects_cross_site_changes(read_only_client: TestClient) -> None:
+    evil = {"origin": "https://evil.example"}
+    for path in (ACTION, "/v1/leagues/board/rollback", "/v1/leagues/board/evaluations", "/docs"):
+        reply = read_only_client.post(path, json=BODY, headers=evil)
+        assert (reply.status_code, reply.json()["code"]) == (403, "cross_site")
+        assert "https://evil.example" in reply.json()["message"]
+    reply = read_only_client.post("/v2/models/board/infer", json={}, headers={"sec-fetch-site": "cross-site"})
+    assert (reply.status_code, list(reply.json())) == (403, ["error"]), "the error format of this protocol"
+    assert read_only_client.post(ACTION, json=BODY, headers={"origin": "http://localhost"}).status_code == 200
+    assert read_only_client.get("/v1/leagues", headers=evil | {"sec-fetch-site": "cross-site"}).status_code == 200
+
+
+GAME = "https://game.example"
+LISTED = QUICK.model_copy(update={"cors_origins": [GAME]})
+PREFLIGHT = {"access-control-request-method": "POST", "access-control-request-headers": "authorization,content-type"}
+
+
+def allowed(reply: httpx.Response) -> str | None:
+    return reply.headers.get("access-control-allow-origin")
+
+
+def test_pages_of_listed_origins_call_with_a_key(registry: Registry) -> None:
+    """On both paths: requests without an origin take the fast one."""
+    _, secret = registry.keys.create("game", ["act"])
+    with listening(registry.storage, LISTED) as listener, httpx.Client(base_url=listener.url) as client:
+        for origin, status, answer in ((GAME, 200, GAME), ("https://game.example.evil", 400, None)):
+            reply = client.options(ACTION, headers=PREFLIGHT | {"origin": origin})
+            assert (reply.status_code, allowed(reply)) == (status, answer)
+        key = {"authorization": f"Bearer {secret}"}
+        from_page = {"origin": GAME, "sec-fetch-site": "cross-site"}
+        reply = client.post(ACTION, json=BODY, headers=key | from_page)
+        assert (reply.status_code, allowed(reply), reply.headers["access-control-expose-headers"]) == (200, GAME, "*")
+        refused = client.post(ACTION, json=BODY, headers=from_page)
+        assert (refused.status_code, allowed(refused)) == (401, GAME), "the page can read the error"
+        elsewhere = client.post(ACTION, json=BODY, headers=key | from_page | {"origin": "https://evil.example"})
+        assert (elsewhere.status_code, allowed(elsewhere)) == (403, None)
+        assert client.post(ACTION, json=BODY, headers=key).json() == reply.json()
+
+
+def test_a_stream_of_a_listed_origin_offers_its_key_as_a_subprotocol(registry: Registry) -> None:
+    _, secret = registry.keys.create("game", ["act"])
+    with listening(registry.storage, LISTED) as listener:
+        open_stream = partial(connect, listener.stream("board"), origin=Origin(GAME), proxy=None)
+        offered = [Subprotocol("policy-league"), Subprotocol(f"policy-league.key.{secret}")]
+        with open_stream(subprotocols=offered) as stream:
+            assert stream.subprotocol == "policy-league"
+            stream.send(json.dumps(BODY))
+            assert json.loads(stream.recv(60))["version"] == 1
+        for others in (offered[:1], [offered[0], Subprotocol("policy-league.key.plk_wrong")]):
+            with pytest.raises(InvalidStatus) as refused, open_stream(subprotocols=others):
+                pass
+            assert refused.value.response.status_code == 401
+
+
+def test_only_names_of_the_loopback_interface_are_accepted() -> None:
+    here = (
+        "localhost",
+        "LocalHost:8000",
+        "league.localhost:8000",
+        "127.0.0.1",
+        "127.0.0.53:8000",
+        "[::1]",
+        "[::1]:8000",
+    )
+    rebound = ("rebound.example", "rebound.example:8000", "localhost.rebound.example", "127.0.0.1.rebound.example")
+    addresses = ("10.0.0.1:8000", "0.0.0.0:8000", "[::2]:8000", "[::1")
+    for host in here:
+        reject_foreign_host([(b"accept", b"*/*"), (b"host", host.encode())])
+    reject_foreign_host([(b"accept", b"*/*")])  # programs may send none
+    for host in (*rebound, *addresses, "notlocalhost", "é", "", "localhost" * 1000):
+        with pytest.raises(UntrustedHost, match="accepts only requests to localhost"):
+            reject_foreign_host([(b"host", b"localhost"), (b"host", host.encode())])
+
+
+REBOUND = {"host": "rebound.example:8000"}
+
+
+def test_a_rebound_page_neither_reads_nor_acts(read_only_client: TestClient) -> None:
+    for path in ("/v1/leagues", "/v1/leagues/board/versions", "/docs", "/metrics", "/v2/models/board"):
+        assert read_only_client.get(path).status_code == 200
+        response = read_only_client.get(path, headers=REBOUND)
+        assert (response.status_code, "rebound.example:8000" in response.text) == (403, True)
+    same_origin = REBOUND | {"sec-fetch-site": "same-origin", "origin": "http://rebound.example:8000"}
+    response = read_only_client.post(ACTION, json=BODY, headers=same_origin)
+    assert (response.status_code, response.json()["code"]) == (403, "untrusted_host")
+    with (
+        pytest.raises(WebSocketDenialResponse) as refused,
+        read_only_client.websocket_connect("/v1/policies/board/stream", headers=REBOUND),
+    ):
+        pass
+    assert refused.value.status_code == 403
+
+
+def test_other_servers_have_any_name(storage: Storage, registry: Registry) -> None:
+    registry.keys.create("reader", ["read"])
+    for leagues, settings, is_exposed, status in (
+        (storage, {"require_keys": "never"}, False, 200),
+        (storage, {}, True, 401),
+        (registry.storage, {}, False, 401),  # it has keys
+    ):
+        process = replace(this_process(), is_exposed=is_exposed)
+        server = Replica(Registry.open(leagues), QUICK.model_copy(update=settings), "replica-1", process)
+        with TestClient(server.application(), base_url="http://league.example") as client:
+            assert client.get("/v1/leagues").status_code == status

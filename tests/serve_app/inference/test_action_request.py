@@ -1,251 +1,273 @@
-"""Encodings and options of action requests: base64, images, probabilities, state tokens."""
+"""Parsing of action requests before the policy is known, tokens of recurrent state, and limits of sizes."""
 
+import base64
 import json
-import shutil
-from base64 import b64encode
-from collections.abc import Iterator
-from pathlib import Path
+import re
 from typing import Any
 
 import numpy as np
 import pytest
-from starlette.testclient import TestClient
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
 
-from league.policies.onnx import OnnxPolicy
-from league.registry.registry import Registry
-from league.settings import Storage
-from serve_app.codecs.request_limits import LARGE_BODY
-from tests.support.clients.actions import BOARD, act, boards, rejected
-from tests.support.leagues.protocol_leagues import DTYPES, FRAME, every_kind
-from tests.support.leagues.served_leagues import MEMORY, build_everything, promote, publish, register
-from tests.support.pictures import png
-from tests.support.policies.graphs import counting, masked_mlp
-from tests.support.servers.replicas import QUICK, replica
-from tests.support.waiting import until
+from league.errors import BodyTooLarge, InvalidInput, InvalidReference, InvalidState, LeagueError
+from league.refs import MAX_VERSION
+from league.spaces import Box, Leaf
+from serve_app.codecs.request_limits import LARGE_BODY, OVERHEAD_SIZE, RequestLimits
+from serve_app.codecs.state_tokens import StateToken, common_version, read_state, read_token, write_tokens
+from serve_app.inference.action_request import KEYS, parse_action_request, pinned_version, reject_unknown_keys
+from tests.support.examples import examples
 
-
-@pytest.fixture(scope="module")
-def kinds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    """A replica with all dtypes and images, for tests that do not change its data."""
-    storage = Storage.at(tmp_path_factory.mktemp("kinds"))
-    every_kind(storage).close()
-    with replica(storage, QUICK.model_copy(update={"max_body": 2**20, "max_batch": 3000})) as client:
-        yield client
+MODEL, SHA256 = "memory.shared", "ab" * 32
 
 
-def b64(array: Any, **more: Any) -> dict[str, Any]:
-    array = np.asarray(array)
-    data = array.astype(array.dtype.newbyteorder("<")).tobytes()
-    return {"b64": b64encode(data).decode()} | more
+LEAVES: list[tuple[str, Leaf]] = [
+    ("state_in_0", Box(dtype="float32", shape=(2, 3), low=None, high=None)),
+    ("state_in_1", Box(dtype="int16", shape=(), low=None, high=None)),
+]
 
 
-def b64_board(board: dict[str, Any]) -> dict[str, Any]:
-    return {name: b64(np.array(value, np.int8)) for name, value in board.items()}
+def some_state(rows: int = 1) -> dict[str, NDArray]:
+    numbers = np.arange(6 * rows, dtype=np.float32).reshape(rows, 2, 3)
+    return {"state_in_0": numbers, "state_in_1": np.arange(rows, dtype=np.int16)}
 
 
-def frames(count: int) -> np.ndarray:
-    return np.random.default_rng(5).integers(0, 256, (count, *FRAME), dtype=np.uint8)
+def token(version: int = 7, state: dict[str, NDArray] | None = None, model: str = MODEL, sha256: str = SHA256) -> str:
+    return write_tokens(model, version, sha256, some_state() if state is None else state)[0]
 
 
-def image(pixels: np.ndarray) -> dict[str, str]:
-    return {"png": b64encode(png(pixels)).decode()}
+def token_of(version: int, model: str = "memory.shared") -> str:
+    return token(version, {"state_in_0": np.zeros((1, 1), np.float32)}, model)
 
 
-def test_base64_gets_the_actions_of_lists(read_only_client: TestClient) -> None:
-    batch = boards(8)
-    expected = act(read_only_client, observations=batch)["actions"]
-    assert act(read_only_client, observations=[b64_board(board) for board in batch])["actions"] == expected
-    mixed = [b64_board(board) if row % 2 else board for row, board in enumerate(batch)]
-    assert act(read_only_client, observations=mixed)["actions"] == expected
-    half = {"observation": batch[0]["observation"], "action_mask": b64_board(batch[0])["action_mask"]}
-    assert act(read_only_client, observation=half)["action"] == expected[0]
+def test_one_observation_is_a_batch_of_one() -> None:
+    request = parse_action_request({"observation": [1, 2]}, max_batch=8)
+    assert (request.observations, request.is_batch, request.strings) == ([[1, 2]], False, 1)
+    options = (request.explore, request.seed, request.probabilities, request.state, request.tokens)
+    assert options == (None, None, False, None, None)
 
 
-def test_base64_supports_each_dtype(kinds: TestClient) -> None:
-    random = np.random.default_rng(0)
-    arrays = {dtype: random.integers(0, 2, (2, 3)).astype(dtype) for dtype in DTYPES}
-    lists = {dtype: array.tolist() for dtype, array in arrays.items()}
-    encoded = {dtype: b64(array, dtype=dtype, shape=[2, 3]) for dtype, array in arrays.items()}
-    assert act(kinds, "kinds", observation=encoded)["action"] == act(kinds, "kinds", observation=lists)["action"]
-
-
-def test_metadata_of_base64_must_match(read_only_client: TestClient) -> None:
-    mask = b64(np.ones(7, np.int8))
-    for leaf, message in (
-        (b64(np.ones(7, np.float32)), "holds 28 bytes, expected 7"),
-        (mask | {"dtype": "float32"}, "nothing is converted"),
-        (mask | {"shape": [1, 7]}, "has shape [1, 7], expected [7]"),
-    ):
-        error = rejected(read_only_client, {"observation": BOARD | {"action_mask": leaf}})
-        assert (error["code"], message in error["message"]) == ("invalid_observation", True), error
-    zeros = b64(np.zeros(7, np.int8))
-    assert rejected(read_only_client, {"observation": BOARD | {"action_mask": zeros}})["code"] == "illegal_mask"
-    infinite = b64(np.array([np.inf, 0], np.float32))
-    assert "infinity" in rejected(read_only_client, {"observation": infinite}, model="vector")["message"]
-    beyond = {"mode": b64(np.int64(9)), "sense": {"speed": [1, 1]}}
-    assert "between 1 and 3" in rejected(read_only_client, {"observation": beyond}, model="nested")["message"]
-
-
-def test_strings_beside_base64_are_rejected(read_only_client: TestClient) -> None:
-    error = rejected(read_only_client, {"observation": b64_board(BOARD) | {"observation": [["0"]]}})
-    assert "where a number is expected" in error["message"]
-
-
-def test_an_image_gets_the_action_of_its_pixels(kinds: TestClient) -> None:
-    for pixels in frames(3):
-        expected = act(kinds, "pistons", observation=pixels.tolist())["action"]
-        assert act(kinds, "pistons", observation=image(pixels))["action"] == expected
-        assert act(kinds, "pistons", observation=b64(pixels))["action"] == expected
-        stack = {"png": [image(pixels[..., [i]])["png"] for i in range(4)]}
-        assert act(kinds, "pistons", observation=stack)["action"] == expected
-    batch = [image(pixels) for pixels in frames(3)]
-    alone = [act(kinds, "pistons", observation=each)["action"] for each in batch]
-    assert act(kinds, "pistons", observations=batch)["actions"] == alone
-
-
-def test_a_small_body_cannot_decode_to_a_large_batch(kinds: TestClient) -> None:
-    black = image(np.zeros(FRAME, np.uint8))
-    body = {"observations": [black] * 2500}  # 70 MB of pixels
-    assert rejected(kinds, body, 413, "pistons")["code"] == "body_too_large"
-
-
-def test_images_of_another_shape_are_rejected(kinds: TestClient) -> None:
-    error = rejected(kinds, {"observation": image(np.zeros((84, 84, 3), np.uint8))}, model="pistons")
-    assert (error["code"], "3 channels" in error["message"]) == ("invalid_observation", True)
-    error = rejected(kinds, {"observation": image(np.zeros((2, 2), np.uint8))}, model="vector")
-    assert "which png cannot encode" in error["message"]
-
-
-def softmax(logits: np.ndarray) -> np.ndarray:
-    weights = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
-    return weights / weights.sum(axis=1, keepdims=True)
-
-
-def test_probabilities_are_returned_on_request(read_only_client: TestClient) -> None:
-    policy, batch = OnnxPolicy(masked_mlp(seed=0)), boards(8)
-    arrays = {name: np.array([board[name] for board in batch], np.int8) for name in BOARD}
-    inputs = policy.distribution(arrays).dist_inputs
-    assert inputs is not None
-    reply = act(read_only_client, observations=batch, probabilities=True)
-    assert reply["probabilities"] == [pytest.approx(row) for row in softmax(inputs)]
-    assert [int(np.argmax(row)) for row in reply["probabilities"]] == reply["actions"]
-    for board, row in zip(batch, reply["probabilities"], strict=True):
-        assert [share == 0 for share in row] == [not allowed for allowed in board["action_mask"]]
-    one = act(read_only_client, observation=batch[0], probabilities=True, explore=True, seed=3)
-    assert one["probabilities"] == pytest.approx(reply["probabilities"][0])
-    assert one["action"] == act(read_only_client, observation=batch[0], explore=True, seed=3)["action"]
-    assert "probabilities" not in act(read_only_client, observation=batch[0], probabilities=False)
-
-
-def test_a_continuous_policy_returns_mean_and_deviation(read_only_client: TestClient) -> None:
-    """The graph outputs the observation as the mean and as the log standard deviation."""
-    reply = act(read_only_client, "vector", observation=[0.5, -1.0], probabilities=True)
-    assert reply["probabilities"] == {
-        "mean": pytest.approx([0.5, -1.0]),
-        "std": pytest.approx([np.exp(0.5), np.exp(-1)]),
+def test_all_options_are_parsed() -> None:
+    document = {
+        "observations": [1, 2],
+        "explore": True,
+        "seed": [3, 4],
+        "probabilities": True,
+        "state": [token_of(7), None],
     }
+    ask = parse_action_request(document, max_batch=8)
+    assert (ask.is_batch, ask.explore, ask.seed, ask.probabilities) == (True, True, [3, 4], True)
+    assert ask.tokens is not None
+    assert [text and text.version for text in ask.tokens] == [7, None]
+    assert ask.strings == 6, "five keys, one token"
 
 
-def act_with_state(client: TestClient, state: Any, version: Any = None, **body: Any) -> dict[str, Any]:
-    body = body or {"observation": [1]}
-    return act(client, "memory", version, state=state, **body)
+def test_state_can_be_arrays() -> None:
+    request = parse_action_request({"observation": 1, "state": {"state_in_0": [[1.0]]}}, max_batch=8)
+    assert (request.state, request.tokens, request.strings) == ({"state_in_0": [[1.0]]}, None, 3)
+    assert parse_action_request({"observation": 1, "state": {}}, max_batch=8).state == {}
 
 
-def test_an_episode_continues_with_its_token(read_only_client: TestClient) -> None:
-    state, actions = None, []
-    for _ in range(4):
-        reply = act_with_state(read_only_client, state)
-        state = reply["state"]
-        assert isinstance(state, str)
-        actions.append(reply["action"])
-    assert actions == [0, 0, 1, 1], "the sum exceeds 2"
-    again = act_with_state(read_only_client, state)
-    assert again["action"] == 1
-    assert act_with_state(read_only_client, state) == again, "calls can be repeated"
+INVALID: tuple[tuple[dict[str, Any], type[LeagueError], str], ...] = (
+    ({}, InvalidInput, "neither observation nor observations"),
+    ({"observation": 1, "observations": [1]}, InvalidInput, "both observation and observations"),
+    ({"observations": 1}, InvalidInput, "observations is a number"),
+    ({"observations": {"observation": 1}}, InvalidInput, "observations is an object"),
+    ({"observations": []}, InvalidInput, "empty"),
+    ({"observations": [1] * 9}, BodyTooLarge, "has 9 items, expected at most 8"),
+    ({"observation": 1, "explore": None}, InvalidInput, "explore is null, expected true or false"),
+    ({"observation": 1, "explore": "yes"}, InvalidInput, "explore is a string"),
+    ({"observation": 1, "probabilities": 1}, InvalidInput, "probabilities is a number"),
+    ({"observation": 1, "probabilities": "yes"}, InvalidInput, "probabilities is a string"),
+    *(({"observation": 1, "seed": seed}, InvalidInput, "seed must be") for seed in (True, 0.5, -1, 2**63, 2**64, [1])),
+    ({"observations": [1, 2], "seed": [1]}, InvalidInput, "seed has 1 integers, expected 2"),
+    ({"observations": [1, 2], "seed": [1, "2"]}, InvalidInput, "seed must be"),
+    ({"observation": 1, "state": 3}, InvalidState, "one string per observation"),
+    ({"observation": 1, "state": [token_of(7)]}, InvalidState, "one string per observation"),
+    ({"observations": [1], "state": token_of(7)}, InvalidState, "state is a string, expected a list"),
+    ({"observations": [1, 2], "state": [token_of(7)]}, InvalidState, "state has 1 items, expected 2"),
+    ({"observations": [1, 2], "state": [token_of(7), "x"]}, InvalidState, "not a complete token"),
+    ({"observations": [1, 2], "state": [token_of(7), {}]}, InvalidState, "one string per observation"),
+)
 
 
-def test_each_episode_of_a_batch_has_its_own_token(read_only_client: TestClient) -> None:
-    tokens = act_with_state(read_only_client, None, observations=[[1], [2], [5]])["state"]
-    assert len(set(tokens)) == 3
-    reply = act_with_state(read_only_client, [tokens[2], None, tokens[0]], observations=[[0], [0], [2]])
-    assert reply["actions"] == [1, 0, 1]
-    assert act_with_state(read_only_client, [None, None], observations=[[1], [3]])["actions"] == [0, 1]
-    assert isinstance(act_with_state(read_only_client, tokens[1])["state"], str), "a token of a batch can be used alone"
+def test_invalid_requests_are_rejected(subtests: pytest.Subtests) -> None:
+    for document, error, message in INVALID:
+        with subtests.test(document=document), pytest.raises(error, match=message):
+            parse_action_request(document, max_batch=8)
 
 
-def test_a_token_is_valid_after_a_promotion(client: TestClient, registry: Registry) -> None:
-    state = act_with_state(client, None)["state"]
-    publish(registry, "memory", {"shared": counting()}, "run/2")
-    promote(registry, "memory", 2)
-    until(lambda: act_with_state(client, None)["version"] == 2)
-    for expected in (0, 1, 1):
-        reply = act_with_state(client, state)
-        state = reply["state"]
-        assert (reply["version"], reply["action"]) == (1, expected)
-    assert act_with_state(client, state, "champion")["version"] == 1, "the alias was resolved when the episode started"
-    assert act_with_state(client, state, 1)["version"] == 1
-    error = rejected(client, {"observation": [1], "state": state}, model="memory", params={"version": "2"})
-    assert (error["code"], "the request is for version 2" in error["message"]) == ("invalid_state", True)
-    fresh = act_with_state(client, None)["state"]
-    error = rejected(client, {"observations": [[1], [1]], "state": [state, fresh]}, model="memory")
-    assert (error["code"], "several versions" in error["message"]) == ("invalid_state", True)
+def test_an_unknown_key_is_rejected() -> None:
+    reject_unknown_keys({"observation": 1, "state": None}, KEYS)
+    with pytest.raises(InvalidInput, match="unknown key 'proabilities', expected analysis, deadline_ms, explore"):
+        reject_unknown_keys({"observation": 1, "proabilities": True}, KEYS)
 
 
-def test_a_pinned_version_answers_after_promotions(client: TestClient, registry: Registry) -> None:
-    for champion in (2, 3, 1):
-        promote(registry, "board", champion)
-        until(lambda champion=champion: act(client, observation=BOARD)["version"] == champion)
-        assert act(client, version=1, observation=BOARD)["version"] == 1
+def pinned(state: Any, version: str, model: str = "memory") -> str:
+    request = parse_action_request({"observations": [1] * len(state), "state": state}, max_batch=8)
+    return pinned_version(request, model, version)
 
 
-def test_a_removed_version_is_reported(client: TestClient, registry: Registry) -> None:
-    state = act_with_state(client, None)["state"]
-    for number in range(2, 2 + QUICK.cached_versions + 1):  # evicts version 1 from the cache
-        publish(registry, "memory", {"shared": counting()}, f"run/{number}")
-        act_with_state(client, None, number)
-    promote(registry, "memory", 2)
-    until(lambda: act_with_state(client, None)["version"] == 2)
-    act_with_state(client, None, 3)
-    shutil.rmtree(registry.artifacts.path("memory", 1))
-    for number in range(3, 3 + QUICK.cached_versions):
-        act_with_state(client, None, number)
-    for body, params in (({"observation": [1], "state": state}, {}), ({"observation": [1]}, {"version": "1"})):
-        error = rejected(client, body, 410, "memory", params=params)
-        assert (error["code"], "memory@1 was retired" in error["message"]) == ("version_retired", True)
-    assert act_with_state(client, None)["version"] == 2, "a new episode starts"
+def test_a_token_selects_the_version() -> None:
+    assert pinned([None], "champion") == "champion"
+    assert pinned([token_of(7)], "champion") == "7"
+    assert pinned([token_of(7)], "7") == "7"
+    assert pinned([None, token_of(7), None, token_of(7)], "candidate", "memory.shared") == "7"
+    assert pinned_version(parse_action_request({"observation": 1}, max_batch=8), "memory", "champion") == "champion"
 
 
-def test_a_token_of_a_republished_version_is_rejected(client: TestClient, tmp_path: Path) -> None:
-    elsewhere = build_everything(Storage.at(tmp_path / "elsewhere"))
-    elsewhere.close()
-    with replica(elsewhere.storage) as other:
-        state = act_with_state(other, None)["state"]
-    error = rejected(client, {"observation": [1], "state": state}, model="memory")
-    assert (error["code"], "a different version 1 of memory.shared" in error["message"]) == ("invalid_state", True)
+def test_a_contradiction_to_a_token_is_rejected() -> None:
+    for state, version, model, error, message in (
+        ([token_of(7)], "8", "memory", InvalidState, "of version 7, but the request is for version 8"),
+        ([token_of(7), token_of(8)], "champion", "memory", InvalidState, "several versions"),
+        ([token_of(7)], "Champion", "memory", InvalidReference, "must consist of"),
+        ([token_of(7)], "champion", "other", InvalidState, "is of memory.shared, expected other"),
+        ([None, token_of(7)], "7", "mem", InvalidState, "expected mem"),
+    ):
+        with pytest.raises(error, match=message):
+            pinned(state, version, model)
 
 
-def test_a_policy_without_state_accepts_no_token(read_only_client: TestClient) -> None:
-    assert "state" not in act(read_only_client, observation=BOARD, state=None)
-    assert "state" not in act(read_only_client, observations=[BOARD], state=[None])
-    state = act_with_state(read_only_client, None)["state"]
-    assert rejected(read_only_client, {"observation": BOARD, "state": state})["code"] == "invalid_state"
+finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
-def test_the_number_of_query_parameters_is_limited(read_only_client: TestClient) -> None:
-    error = rejected(read_only_client, {"observation": BOARD}, params=[("a", "1")] * 17)
-    assert (error["code"], "more than 16" in error["message"]) == ("invalid_input", True)
+def states(rows: int) -> st.SearchStrategy[dict[str, NDArray]]:
+    numbers = arrays(np.float32, (rows, 2, 3), elements=finite)
+    return st.fixed_dictionaries({"state_in_0": numbers, "state_in_1": arrays(np.int16, (rows,))})
 
 
-def test_a_large_request_without_a_champion_is_answered_if_a_token_names_the_version(registry: Registry) -> None:
-    """Its episode began with a version by number."""
-    settings = QUICK.model_copy(update={"max_body": 2**20, "max_batch": 1024})
-    register(registry, "unpromoted", {"shared": MEMORY})
-    publish(registry, "unpromoted", {"shared": counting()}, "run")
-    with replica(registry.storage, settings) as client:
-        path, rows = "/v1/policies/unpromoted/action", 512
-        body = {"observations": [[0]] * rows}
-        begun = client.post(f"{path}?version=1", json=body)
-        assert begun.status_code == 200, begun.text
-        content = json.dumps(body | {"state": begun.json()["state"]}).encode()
-        assert len(content) > LARGE_BODY
-        assert client.post(path, content=content).status_code == 200
+@given(data=st.data(), rows=st.integers(1, 4), version=st.integers(1, MAX_VERSION))
+def test_a_state_survives_encoding(data: st.DataObject, rows: int, version: int) -> None:
+    state = data.draw(states(rows))
+    texts = write_tokens(MODEL, version, SHA256, state)
+    tokens = [read_token(text) for text in texts]
+    assert len(texts) == rows
+    assert all(re.fullmatch(r"[A-Za-z0-9_-]+", text) for text in texts)
+    assert {(each.model, each.version) for each in tokens} == {(MODEL, version)}
+    assert common_version(tokens) == version
+    read = read_state(tokens, MODEL, SHA256, LEAVES)
+    for name, array in state.items():
+        assert (read[name].dtype, read[name].shape) == (array.dtype, array.shape)
+        assert read[name].tobytes() == array.tobytes()
+        assert read[name].flags.aligned
+
+
+def test_missing_tokens_are_zero_states() -> None:
+    tokens = [None, *(read_token(text) for text in write_tokens(MODEL, 7, SHA256, some_state(2))), None]
+    read = read_state(tokens, MODEL, SHA256, LEAVES)
+    assert read["state_in_0"][1:3].tolist() == some_state(2)["state_in_0"].tolist()
+    assert not read["state_in_0"][[0, 3]].any()
+    assert read["state_in_1"].tolist() == [0, 0, 1, 0]
+
+
+def test_a_token_is_little_longer_than_its_state() -> None:
+    state = {"state_in_0": np.zeros((1, 256), np.float32)}
+    assert len(token(state=state)) < 4 / 3 * 1024 + 80
+
+
+def test_an_invalid_token_is_rejected() -> None:
+    for text in ("", "a", "abcd", "****", "Ä" * 40, "a" * 200, "=" * 40, "\0", "\n" * 4, "🎲" * 9):
+        with pytest.raises(InvalidState, match="not a complete token of an earlier response"):
+            read_token(text)
+    for value in (3, 1.5, True, [], ["a"], {}, b"a", [[1.0]]):
+        with pytest.raises(InvalidState, match="one string per observation"):
+            read_token(value)
+
+
+@examples(300)
+@given(at=st.integers(0, 500), put=st.text(max_size=3), cut=st.integers(0, 3))
+def test_a_damaged_token_is_rejected(at: int, put: str, cut: int) -> None:
+    valid = token()
+    at %= len(valid)
+    damaged = valid[:at] + put + valid[at + cut :]
+    try:
+        read = read_token(damaged)
+    except InvalidState:
+        return
+    # The last digit of base64 may have unused bits.
+    assert damaged[: len(valid) - 1] == valid[:-1]
+    assert read == read_token(valid)
+
+
+@examples(300)
+@given(text=st.text(alphabet="ABCXYZabcxyz0189-_", max_size=120) | st.text(max_size=60))
+def test_any_text_is_rejected_cleanly(text: str) -> None:
+    with pytest.raises(InvalidState):
+        read_token(text)
+
+
+def test_a_token_of_another_policy_is_rejected() -> None:
+    for other, message in (
+        (token(model="memory.other"), "is of memory.other, expected memory.shared"),
+        (token(model="memories.shared"), "is of memories.shared"),
+        (token(sha256="cd" * 32), "a different version 7 of memory.shared than the one in this registry"),
+        (token(state={"state_in_0": np.zeros((1, 2, 3), np.float32)}), "has 24 bytes, expected 26"),
+        (token(state={"state_in_0": np.zeros((1, 7), np.float32)}), "has 28 bytes, expected 26"),
+        (token(state=some_state() | {"state_in_0": np.full((1, 2, 3), np.nan, np.float32)}), "NaN"),
+        (token(state=some_state() | {"state_in_0": np.full((1, 2, 3), np.inf, np.float32)}), "infinity"),
+    ):
+        with pytest.raises(InvalidState, match=message):
+            read_state([read_token(other)], MODEL, SHA256, LEAVES)
+
+
+def test_tokens_of_several_versions_cannot_be_combined() -> None:
+    tokens: list[StateToken] = [read_token(token(version)) for version in (3, 2, 3)]
+    with pytest.raises(InvalidState, match="several versions \\(2, 3\\)"):
+        common_version(tokens)
+
+
+MAX_BATCH = 64
+SHAPES = st.lists(st.lists(st.integers(1, 6), max_size=4).map(tuple), min_size=1, max_size=3)
+NUMBERS = st.sampled_from([0.0, 1.0, -1.7976931348623157e308, 5e-324])
+INDENTS = st.sampled_from([None, 1])
+
+
+def limits_of(shapes: list[tuple[int, ...]]) -> RequestLimits:
+    return RequestLimits.of([Box(dtype="float64", shape=shape, low=None, high=None) for shape in shapes])
+
+
+@st.composite
+def requests(draw: st.DrawFn) -> tuple[RequestLimits, int, bytes]:
+    """The limits of a space, and a valid request: its number of observations and its body."""
+    shapes, rows, indent = draw(SHAPES), draw(st.integers(1, MAX_BATCH)), draw(INDENTS)
+    number, encode = draw(NUMBERS), draw(st.sampled_from([lambda leaf: leaf.tolist(), _base64]))
+    observation = {f"leaf{index}": encode(np.full(shape, number)) for index, shape in enumerate(shapes)}
+    document = {"observations": [observation] * rows, "seed": [2**63 - 1] * rows, "explore": True}
+    return limits_of(shapes), rows, json.dumps(document, indent=indent).encode()
+
+
+def _base64(leaf: NDArray) -> dict[str, Any]:
+    return {"b64": base64.b64encode(leaf.tobytes()).decode(), "dtype": "float64", "shape": list(leaf.shape)}
+
+
+@given(requests())
+def test_valid_requests_are_within_the_limits(request: tuple[RequestLimits, int, bytes]) -> None:
+    limits, rows, body = request
+    limits.check_size(len(body), rows)
+    limits.check_body(body, MAX_BATCH)
+    limits.check_body(memoryview(body), MAX_BATCH)
+
+
+def test_bodies_that_are_expensive_to_parse_are_rejected() -> None:
+    """Half a megabyte, for a policy with four numbers in a list."""
+    for part, what in (
+        (b"[],", "lists and objects"),
+        (b"[[1]],", "lists and objects"),
+        (b"{},", "lists and objects"),
+        (b"1,", "commas"),
+        (b"1.000000000000000000,", "commas"),
+    ):
+        with pytest.raises(BodyTooLarge, match=f"{what}, expected at most"):
+            limits_of([(4,)]).check_body(b"[" + part * (2**19 // len(part)), 1024)
+
+
+def test_the_size_is_limited_by_the_number_of_observations() -> None:
+    limits = limits_of([(4,)])
+    limits.check_size(OVERHEAD_SIZE + limits.size, 1)
+    with pytest.raises(BodyTooLarge, match=r"the body has \d+ bytes, expected at most \d+ for 1 observations"):
+        limits.check_size(OVERHEAD_SIZE + limits.size + 1, 1)
+    limits.check_size(OVERHEAD_SIZE + limits.size + 1, 2)
+    with pytest.raises(BodyTooLarge, match=r"expected at most \d+ for 8 observations"):
+        limits.check_body(b" " * 4 * LARGE_BODY, 8)

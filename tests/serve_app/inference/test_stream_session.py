@@ -1,19 +1,26 @@
-"""Messages of a stream: their answers, the state between them, and the version that answers."""
+"""Messages of a stream: their encoding, their answers, the state between them, and the version that answers."""
 
+import asyncio
 import json
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays as any_array
+from hypothesis.extra.numpy import from_dtype
 from starlette.testclient import TestClient, WebSocketDenialResponse, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 
-from league.errors import LeagueError, Overloaded
+from league.errors import GraphTimeout, LeagueError, ObservationError, Overloaded
 from league.policies.onnx import OnnxPolicy
+from league.policies.policy import Actions
 from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
@@ -21,13 +28,17 @@ from league.registry.storage.rows import Portion
 from league.settings import Storage
 from serve_app.access import api_keys
 from serve_app.access.api_keys import TokenBucket
-from serve_app.app import Replica
-from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, encode_request
-from tests.support.clients.actions import BAD_BODIES, BOARD, act, boards
+from serve_app.access.load_shedding import Backlog
+from serve_app.inference.action_request import Arrays
+from serve_app.inference.stream_batches import StreamBatches
+from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, BinaryCodec, encode_request, parse_request
+from serve_app.live_versions.version_cache import ActionSelections, LoadedPolicy, load
+from tests.support.clients.actions import BOARD, act, board_arrays, boards
+from tests.support.leagues.protocol_leagues import DTYPES, every_kind
 from tests.support.leagues.served_leagues import promote, publish
 from tests.support.policies.graphs import counting, masked_mlp
 from tests.support.servers.exposition import value
-from tests.support.servers.replicas import QUICK, local_client, replica
+from tests.support.servers.replicas import QUICK, replica
 from tests.support.servers.shadows import set_shadow, wait_for
 from tests.support.waiting import until
 
@@ -65,7 +76,7 @@ def binary(stream: WebSocketTestSession, message: bytes) -> tuple[np.ndarray, in
 
 
 def arrays(batch: list[dict[str, Any]]) -> list[np.ndarray]:
-    return [np.array([board[name] for board in batch], np.int8) for name in ("observation", "action_mask")]
+    return list(board_arrays(batch).values())
 
 
 def counter_message(rows: int, reset: bool = False, amount: float = 1) -> bytes:
@@ -97,15 +108,10 @@ def test_binary_messages_are_answered_like_json(read_only_client: TestClient) ->
         best = act(read_only_client, observations=batch)["actions"]
         actions, version = binary(stream, encode_request(arrays(batch), 8))
         assert (actions.tolist(), version) == (best, 1)
-        for seed in (3, [5] * 8):
-            drawn = act(read_only_client, observations=batch, explore=True, seed=seed)["actions"]
-            one = seed if isinstance(seed, int) else None
-            answered = [
-                binary(stream, encode_request(arrays([board]), 1, 5, explore=True))[0][0]
-                for board in batch
-                if one is None
-            ] or binary(stream, encode_request(arrays(batch), 8, one, explore=True))[0].tolist()
-            assert answered == drawn
+        together = binary(stream, encode_request(arrays(batch), 8, 3, explore=True))[0]
+        assert together.tolist() == act(read_only_client, observations=batch, explore=True, seed=3)["actions"]
+        alone = [binary(stream, encode_request(arrays([board]), 1, 5, explore=True))[0][0] for board in batch]
+        assert alone == act(read_only_client, observations=batch, explore=True, seed=[5] * 8)["actions"]
         assert answer_to(stream, observation=batch[0])["action"] == best[0], "both formats can be mixed"
 
 
@@ -124,10 +130,7 @@ def test_recurrent_state_is_kept_by_the_stream(read_only_client: TestClient) -> 
         assert "state" not in answer_to(stream, **ONE)
         assert answer_to(stream, **ONE, reset=True)["action"] == 0
         assert [answer_to(stream, **ONE)["action"] for _ in range(2)] == [0, 1]
-        assert [binary(stream, counter_message(1))[0][0], binary(stream, counter_message(1, reset=True))[0][0]] == [
-            1,
-            0,
-        ]
+        assert [binary(stream, counter_message(1, reset=reset))[0][0] for reset in (False, True)] == [1, 0]
         assert answer_to(stream, **ONE, state=None)["action"] == 0, "null also starts an episode"
         signature = answer_to(stream, reset=True)
         assert signature == {"reset": True} | {name: signature[name] for name in ("model", "version", "sha256")}
@@ -153,15 +156,6 @@ def test_each_row_of_a_batch_has_its_own_state(read_only_client: TestClient) -> 
         )
         assert answer_to(stream, observations=rows[:2], reset=True)["actions"] == [0, 0]
         assert answer_to(stream, observation=[3], reset=True)["action"] == 1
-
-
-def test_a_rejected_message_with_resets_does_not_reset(read_only_client: TestClient) -> None:
-    rows = [[1], [2], [0]]
-    with open_stream(read_only_client, "memory") as stream:
-        assert answer_to(stream, observations=rows)["actions"] == [0, 0, 0]
-        error = send(stream, {"observations": [[1], ["x"], [0]], "reset": [True, True, False]})
-        assert error["code"] == "invalid_observation"
-        assert answer_to(stream, observations=rows)["actions"] == [0, 1, 0]
 
 
 def test_state_can_be_returned_and_set_as_a_token(read_only_client: TestClient) -> None:
@@ -191,15 +185,14 @@ def test_a_stream_is_pinned_to_its_version(client: TestClient, registry: Registr
 
 
 def test_a_following_stream_answers_with_the_current_version(client: TestClient, registry: Registry) -> None:
-    expected = {version: masked_mlp(seed=version - 1) for version in (1, 2, 3)}
     (board,) = boards(1)
-    batch = dict(zip(("observation", "action_mask"), arrays([board]), strict=True))
     with open_stream(client, query="?follow=champion") as stream:
         for version in (2, 3, 1):
             promote(registry, "board", version)
             until(lambda version=version: answer_to(stream, observation=board)["version"] == version)
             actions, answered = binary(stream, encode_request(arrays([board]), 1))
-            assert (answered, actions.tolist()) == (version, OnnxPolicy(expected[version]).act(batch).actions.tolist())
+            expected = OnnxPolicy(masked_mlp(seed=version - 1)).act(board_arrays([board])).actions
+            assert (answered, actions.tolist()) == (version, expected.tolist())
 
 
 def test_a_following_stream_reports_that_its_alias_was_removed(client: TestClient, registry: Registry) -> None:
@@ -231,16 +224,6 @@ def test_an_episode_keeps_its_version_in_a_following_stream(
         assert answer_to(stream, reset=True)["version"] == second
 
 
-def test_a_token_of_another_version_is_rejected_by_a_pinned_stream(client: TestClient, second: int) -> None:
-    token = act(client, "memory", version=second, **ONE)["state"]
-    with open_stream(client, "memory") as stream:
-        answer_to(stream, observation=[2])
-        error = send(stream, ONE | {"state": token})
-        assert (error["code"], error["status"]) == ("invalid_state", 400)
-        assert f"version {second}" in error["message"]
-        assert answer_to(stream, **ONE)["action"] == 1, "the episode of the stream continues"
-
-
 def test_a_canary_applies_to_following_streams_by_key(client: TestClient, registry: Registry) -> None:
     setting = registry.traffic.set("board", canary=Portion(2, 1.0), actor="test", reason="test")
     until(lambda: [one.traffic for one in registry.replicas.acknowledgements("board")] == [setting.id])
@@ -254,109 +237,84 @@ def test_a_canary_applies_to_following_streams_by_key(client: TestClient, regist
         until(lambda: answer_to(with_key, **BODY)["version"] == 1)
 
 
-@pytest.mark.parametrize("name", sorted(BAD_BODIES.keys() - {"bytes"}))
-def test_a_rejected_message_does_not_end_the_stream(read_only_client: TestClient, name: str) -> None:
-    body, code, message = BAD_BODIES[name]
-    text = body if isinstance(body, bytes) else json.dumps(body).encode()
-    with open_stream(read_only_client) as stream:
-        error = send(stream, text.decode())
-        assert error.keys() == {"code", "message", "status"}
-        assert (error["code"], error["status"]) == (code, 400)
-        assert message in error["message"]
-        assert answer_to(stream, **BODY)["version"] == 1
-
-
-@pytest.mark.parametrize(
-    ("message", "code", "expected"),
-    [
-        (ONE | {"reset": 1}, "invalid_input", "reset is a number, expected true or false"),
-        (ONE | {"reset": [True]}, "invalid_input", "reset is a list"),
-        ({"observations": [[1]], "reset": [True, True]}, "invalid_input", "must have 1"),
-        ({"observations": [[1]], "reset": [1]}, "invalid_input", "must have 1"),
-        (ONE | {"return_state": "yes"}, "invalid_input", "return_state"),
-        ({"reset": False}, "invalid_input", "neither observation nor observations"),
-        ({"reset": True, "explore": True}, "invalid_input", "neither observation nor observations"),
-        (ONE | {"state": {}}, "invalid_state", "streams do not accept arrays"),
-        (ONE | {"state": "AQEA"}, "invalid_state", "not a complete token"),
-        (ONE | {"forget": True}, "invalid_input", "'forget'"),
-        ({"observation": ["1"]}, "invalid_observation", "where a number"),
-        ({"observations": [[1]] * 9}, "body_too_large", "at most 8"),
-    ],
+INVALID_OPTIONS: tuple[tuple[dict[str, Any], str, str], ...] = (
+    (ONE | {"reset": 1}, "invalid_input", "reset is a number, expected true or false"),
+    (ONE | {"reset": [True]}, "invalid_input", "reset is a list"),
+    ({"observations": [[1]], "reset": [True, True]}, "invalid_input", "must have 1"),
+    ({"observations": [[1]], "reset": [1]}, "invalid_input", "must have 1"),
+    (ONE | {"return_state": "yes"}, "invalid_input", "return_state"),
+    ({"reset": False}, "invalid_input", "neither observation nor observations"),
+    ({"reset": True, "explore": True}, "invalid_input", "neither observation nor observations"),
+    (ONE | {"state": {}}, "invalid_state", "streams do not accept arrays"),
+    (ONE | {"state": "AQEA"}, "invalid_state", "not a complete token"),
+    (ONE | {"forget": True}, "invalid_input", "'forget'"),
+    ({"observation": ["1"]}, "invalid_observation", "where a number"),
+    ({"observations": [["1"]], "reset": [True]}, "invalid_observation", "where a number"),
+    ({"observations": [[1]] * 9}, "body_too_large", "at most 8"),
 )
-def test_invalid_stream_options_are_rejected(
-    read_only_client: TestClient, message: Any, code: str, expected: str
-) -> None:
-    with open_stream(read_only_client, "memory") as stream:
-        answer_to(stream, observation=[2])
-        error = send(stream, message)
-        assert error["code"] == code
-        assert expected in error["message"]
-        assert answer_to(stream, **ONE)["action"] == 1, "the state is unchanged"
 
 
-def test_reset_and_state_contradict_each_other(read_only_client: TestClient) -> None:
-    with open_stream(read_only_client, "memory") as stream:
+def test_invalid_stream_options_are_rejected(read_only_client: TestClient, subtests: pytest.Subtests) -> None:
+    with open_stream(read_only_client, "memory") as stream, open_stream(read_only_client) as other:
         token = answer_to(stream, **ONE, return_state=True)["state"]
-        assert send(stream, ONE | {"reset": True, "state": token})["code"] == "invalid_state"
-    with open_stream(read_only_client) as stream:
-        error = send(stream, BODY | {"state": token})
+        both = (ONE | {"reset": True, "state": token}, "invalid_state", "")
+        for message, code, expected in (*INVALID_OPTIONS, both):
+            with subtests.test(message=message):
+                answer_to(stream, observation=[2], reset=True)
+                error = send(stream, message)
+                assert (error["code"], expected in error["message"]) == (code, True), error
+                assert answer_to(stream, **ONE)["action"] == 1, "the state is unchanged"
+        error = send(other, BODY | {"state": token})
         assert (error["code"], "expected board" in error["message"]) == ("invalid_state", True)
 
 
 HEAD = REQUEST.pack(1, 0, 0, 1, 0)
 
 
-@pytest.mark.parametrize(
-    ("message", "code", "expected"),
-    [
-        (b"", "invalid_input", "0 bytes, expected a header of 16"),
-        (HEAD[:15], "invalid_input", "15 bytes"),
-        (b"\2" + HEAD[1:], "invalid_input", "02 00 00 00"),
-        (REQUEST.pack(1, 32, 0, 1, 0), "invalid_input", "01 20"),
-        (REQUEST.pack(1, 17, 0, 1, 0), "invalid_input", "not both"),
-        (REQUEST.pack(1, 0, 1, 1, 0), "invalid_input", "expected 01"),
-        (REQUEST.pack(1, 0, 0, 0, 0), "invalid_input", "0 rows"),
-        (REQUEST.pack(1, 0, 0, 9, 0), "body_too_large", "1 to 8"),
-        (REQUEST.pack(1, 2, 0, 1, 2**63), "invalid_input", "seed"),
-        (REQUEST.pack(1, 0, 0, 1, 7), "invalid_input", "seed"),
-        (REQUEST.pack(1, 8, 0, 2, 0) + b"\0", "invalid_input", "2 bytes of 0 or 1"),
-        (REQUEST.pack(1, 8, 0, 2, 0) + b"\0\2", "invalid_input", "2 bytes of 0 or 1"),
-        (HEAD, "invalid_observation", "0 bytes, expected 91: 1 rows of 84 observation + 7 action_mask"),
-        (HEAD + bytes(90), "invalid_observation", "90 bytes"),
-        (HEAD + bytes(91), "illegal_mask", "at least one"),
-    ],
+NOT_FINITE = encode_request([np.array([np.nan, 0], "<f4")], 1)
+OUT_OF_RANGE = encode_request([np.array([4], "<i8"), np.zeros(2, "<f4")], 1)
+INVALID_MESSAGES = (
+    ("board", b"", "invalid_input", "0 bytes, expected a header of 16"),
+    ("board", HEAD[:15], "invalid_input", "15 bytes"),
+    ("board", b"\2" + HEAD[1:], "invalid_input", "02 00 00 00"),
+    ("board", REQUEST.pack(1, 32, 0, 1, 0), "invalid_input", "01 20"),
+    ("board", REQUEST.pack(1, 17, 0, 1, 0), "invalid_input", "not both"),
+    ("board", REQUEST.pack(1, 0, 1, 1, 0), "invalid_input", "expected 01"),
+    ("board", REQUEST.pack(1, 0, 0, 0, 0), "invalid_input", "0 rows"),
+    ("board", REQUEST.pack(1, 0, 0, 9, 0), "body_too_large", "1 to 8"),
+    ("board", REQUEST.pack(1, 2, 0, 1, 2**63), "invalid_input", "seed"),
+    ("board", REQUEST.pack(1, 0, 0, 1, 7), "invalid_input", "seed"),
+    ("board", REQUEST.pack(1, 8, 0, 2, 0) + b"\0", "invalid_input", "2 bytes of 0 or 1"),
+    ("board", REQUEST.pack(1, 8, 0, 2, 0) + b"\0\2", "invalid_input", "2 bytes of 0 or 1"),
+    ("board", HEAD, "invalid_observation", "0 bytes, expected 91: 1 rows of 84 observation + 7 action_mask"),
+    ("board", HEAD + bytes(90), "invalid_observation", "90 bytes"),
+    ("board", HEAD + bytes(91), "illegal_mask", "at least one"),
+    ("vector", NOT_FINITE, "invalid_observation", "finite"),
+    ("nested", OUT_OF_RANGE, "invalid_observation", "observation.mode must be between 1 and 3"),
 )
-def test_an_invalid_binary_message_is_rejected(
-    read_only_client: TestClient, message: bytes, code: str, expected: str
-) -> None:
-    with open_stream(read_only_client) as stream:
-        stream.send_bytes(message)
-        error = stream.receive_json()
-        assert error["code"] == code
-        assert expected in error["message"]
-        assert answer_to(stream, **BODY)["version"] == 1
 
 
-@pytest.mark.parametrize(
-    ("model", "tensors", "expected"),
-    [
-        ("vector", [np.array([np.nan, 0], "<f4")], "finite"),
-        ("nested", [np.array([4], "<i8"), np.zeros(2, "<f4")], "observation.mode must be between 1 and 3"),
-    ],
-)
-def test_values_are_checked_like_on_the_action_route(
-    read_only_client: TestClient, model: str, tensors: list[np.ndarray], expected: str
-) -> None:
-    with open_stream(read_only_client, model) as stream:
-        stream.send_bytes(encode_request(tensors, 1))
-        error = stream.receive_json()
-        assert error["code"] == "invalid_observation"
-        assert expected in error["message"]
+def test_an_invalid_binary_message_is_rejected(read_only_client: TestClient, subtests: pytest.Subtests) -> None:
+    with ExitStack() as stack:
+        models = ("board", "vector", "nested")
+        streams = {model: stack.enter_context(open_stream(read_only_client, model)) for model in models}
+        for model, message, code, expected in INVALID_MESSAGES:
+            with subtests.test(message=message[:20]):
+                streams[model].send_bytes(message)
+                error = streams[model].receive_json()
+                assert (error["code"], expected in error["message"]) == (code, True), error
+        assert answer_to(streams["board"], **BODY)["version"] == 1
 
 
-@pytest.mark.parametrize(
-    ("model", "query", "status", "code"),
-    [
+def denied(client: TestClient, query: str = "", model: str = "board", **headers: str) -> WebSocketDenialResponse:
+    """The response to a stream that is not opened."""
+    with pytest.raises(WebSocketDenialResponse) as caught, open_stream(client, model, query, **headers):
+        pass
+    return caught.value
+
+
+def test_a_stream_that_cannot_be_opened_is_rejected(read_only_client: TestClient, subtests: pytest.Subtests) -> None:
+    for model, query, status, code in (
         ("nobody", "", 404, "unknown_league"),
         ("board", "?version=99", 404, "unknown_version"),
         ("board", "?follow=rival", 404, "unknown_alias"),
@@ -365,22 +323,11 @@ def test_values_are_checked_like_on_the_action_route(
         ("board.other", "", 404, "unknown_policy"),
         ("duo", "", 404, "unknown_policy"),
         ("headless", "", 503, "not_ready"),
-    ],
-)
-def test_a_stream_that_cannot_be_opened_is_rejected(
-    read_only_client: TestClient, model: str, query: str, status: int, code: str
-) -> None:
-    with pytest.raises(WebSocketDenialResponse) as caught, open_stream(read_only_client, model, query):
-        pass
-    assert (caught.value.status_code, caught.value.json()["code"]) == (status, code)
-    assert ("retry-after" in caught.value.headers) == (status == 503)
-
-
-def test_a_removed_version_is_reported(client: TestClient, registry: Registry) -> None:
-    shutil.rmtree(registry.artifacts.path("board", 2))
-    with pytest.raises(WebSocketDenialResponse) as caught, open_stream(client, query="?version=2"):
-        pass
-    assert (caught.value.status_code, caught.value.json()["code"]) == (410, "version_retired")
+    ):
+        with subtests.test(model=model, query=query):
+            response = denied(read_only_client, query, model)
+            assert (response.status_code, response.json()["code"]) == (status, code)
+            assert ("retry-after" in response.headers) == (status == 503)
 
 
 def test_the_number_of_streams_is_limited(storage: Storage) -> None:
@@ -388,9 +335,8 @@ def test_the_number_of_streams_is_limited(storage: Storage) -> None:
         for _ in range(2):
             with open_stream(client) as stream:
                 answer_to(stream, **BODY)
-                with pytest.raises(WebSocketDenialResponse) as caught, open_stream(client):
-                    pass
-                assert (caught.value.status_code, caught.value.json()["code"]) == (429, "overloaded")
+                response = denied(client)
+                assert (response.status_code, response.json()["code"]) == (429, "overloaded")
 
 
 def close_of(stream: WebSocketTestSession, message: Any) -> WebSocketDisconnect:
@@ -438,53 +384,31 @@ def test_a_message_that_is_too_large_ends_the_stream(read_only_client: TestClien
         assert caught.value.code == 1009
 
 
-@pytest.fixture
-def server(registry: Registry) -> Replica:
-    return Replica(Registry.open(registry.storage), QUICK, "replica-1")
-
-
-@pytest.fixture
-def patchable_client(server: Replica) -> Iterator[TestClient]:
-    """The application of `server`, which a test may patch."""
-    with local_client(server) as client:
-        yield client
-
-
-def test_a_persistent_queue_is_shed(
-    server: Replica, patchable_client: TestClient, monkeypatch: pytest.MonkeyPatch
+def test_neither_a_full_queue_nor_an_internal_error_ends_a_stream(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(_: Any) -> None:
-        raise Overloaded("more than 64 requests wait here already")
-
-    with open_stream(patchable_client) as stream:
-        monkeypatch.setattr(type(server.access.backlog), "admit", full)
-        error = send(stream, BODY)
-        assert (error["code"], error["status"], error["retry_after"]) == ("overloaded", 429, 1)
-        monkeypatch.undo()
-        answer_to(stream, **BODY)
-
-
-@pytest.mark.parametrize(
-    ("fault", "code", "status"), [(MemoryError("no room"), "internal_error", 500), (LeagueError("so"), "error", 500)]
-)
-def test_an_internal_error_does_not_end_the_stream(
-    patchable_client: TestClient,
-    monkeypatch: pytest.MonkeyPatch,
-    fault: Exception,
-    code: str,
-    status: int,
-) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        raise fault
-
-    with open_stream(patchable_client) as stream:
-        # Not of one policy: a replica that is slow for a moment runs another.
-        monkeypatch.setattr(OnnxPolicy, "act", fail)
-        error = send(stream, BODY)
-        assert (error["status"], "no room" in error["message"]) == (status, False)
-        monkeypatch.undo()
-        answer_to(stream, **BODY)
-    until(lambda: value(patchable_client, "league_errors_total", league="board", code=error["code"]) == 1)
+    shutil.rmtree(registry.artifacts.path("board", 2))
+    with replica(registry.storage) as client, open_stream(client) as stream:
+        response = denied(client, "?version=2")
+        assert (response.status_code, response.json()["code"]) == (410, "version_retired")
+        for owner, function, fault, code, status in (
+            (Backlog, "admit", Overloaded("more than 64 requests wait"), "overloaded", 429),
+            # Not of one policy: a replica that is slow for a moment runs another.
+            (OnnxPolicy, "act", MemoryError("no room"), "internal_error", 500),
+            (OnnxPolicy, "act", LeagueError("so"), "league_error", 500),
+        ):
+            with monkeypatch.context() as patch:
+                patch.setattr(owner, function, Mock(side_effect=fault))
+                error = send(stream, BODY)
+            assert (error["code"], error["status"], error.get("retry_after")) == (
+                code,
+                status,
+                1 if status == 429 else None,
+            )
+            assert "no room" not in error["message"]
+            answer_to(stream, **BODY)
+            if status == 500:
+                until(lambda code=code: value(client, "league_errors_total", league="board", code=code) == 1)
 
 
 def test_messages_are_counted(client: TestClient) -> None:
@@ -510,26 +434,199 @@ def test_messages_are_mirrored_to_the_shadow(client: TestClient, registry: Regis
             answer_to(stream, observation=board)
             answer_to(pinned, observation=board)
         binary(stream, encode_request(arrays(observations[4:]), 8))
-    found = wait_for(registry, lambda one: one.requests == 5)
-    batch = dict(zip(("observation", "action_mask"), arrays(observations), strict=True))
-    first, second = (OnnxPolicy(masked_mlp(seed=seed)).act(batch).actions for seed in (0, 1))
-    assert (found.champion, found.observations) == (1, 12)
-    assert found.agreed == int((first == second).sum())
+    counts = wait_for(registry, lambda one: one.requests == 5)
+    first, second = (OnnxPolicy(masked_mlp(seed=seed)).act(board_arrays(observations)).actions for seed in (0, 1))
+    assert (counts.champion, counts.observations) == (1, 12)
+    assert counts.agreed == int((first == second).sum())
 
 
-def test_a_continued_episode_is_not_mirrored(client: TestClient, registry: Registry, second: int) -> None:
-    set_shadow(registry, second, league="memory")
-    with open_stream(client, "memory") as stream:
-        for _ in range(3):
-            answer_to(stream, **ONE)
-        answer_to(stream, **ONE, reset=True)
-    found = wait_for(registry, lambda one: one.requests + one.skipped == 4, league="memory")
-    assert (found.requests, found.skipped) == (2, 2)
+MAX_ROWS = 64
+"""Maximum number of rows in a message."""
 
 
-def test_a_slow_graph_does_not_block_other_requests(registry: Registry) -> None:
-    """Rows beyond the inline limit run in a thread, and are answered on the same stream."""
-    settings = QUICK.model_copy(update={"inline": 1e-9})
-    with replica(registry.storage, settings) as client, open_stream(client, "memory") as stream:
-        assert [answer_to(stream, **ONE)["action"] for _ in range(4)] == [0, 0, 1, 1]
-        assert binary(stream, counter_message(1))[0].tolist() == [1]
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoadedPolicy]:
+    registry = every_kind(Storage.at(tmp_path_factory.mktemp("framing")))
+    loaded = {
+        league: load(registry, league, 1, inline=1, selections=ActionSelections()).policy(None)
+        for league in ("kinds", "board", "vector", "chess", "memory")
+    }
+    registry.close()
+    return loaded
+
+
+def leaves(dtype: str, rows: int) -> st.SearchStrategy[np.ndarray]:
+    """Arrays of any bytes, without NaN and infinity: requests may contain neither."""
+    shape, kind = (rows, 2, 3), np.dtype(dtype)
+    size = int(np.prod(shape)) * kind.itemsize
+
+    def array(content: bytes) -> np.ndarray:
+        if kind.kind == "b":
+            return (np.frombuffer(content, np.uint8) & 1).astype(bool).reshape(shape)
+        values = np.frombuffer(content, kind).reshape(shape)
+        return np.where(np.isfinite(values), values, kind.type(0)) if kind.kind == "f" else values
+
+    return st.binary(min_size=size, max_size=size).map(array)
+
+
+@st.composite
+def request_data(draw: st.DrawFn) -> dict[str, Any]:
+    rows = draw(st.integers(1, 3))
+    return {
+        "rows": rows,
+        "seed": draw(st.none() | st.integers(0, 2**63 - 1)),
+        "explore": draw(st.none() | st.booleans()),
+        "reset": draw(st.booleans()),
+        "tensors": [draw(leaves(dtype, rows)) for dtype in DTYPES],
+    }
+
+
+@settings(max_examples=50)
+@given(data=request_data(), has_resets=st.booleans())
+def test_requests_survive_encoding(policies: dict[str, LoadedPolicy], data: dict[str, Any], has_resets: bool) -> None:
+    codec = BinaryCodec(policies["kinds"])
+    names = [name for name, *_ in policies["kinds"].reader.leaves]
+    assert names == [tensor.name for tensor in policies["kinds"].manifest.inputs]
+    by_dtype = dict(zip(DTYPES, data["tensors"], strict=True))
+    tensors = [by_dtype[name.removeprefix("observation.")] for name in names]
+    message = encode_request(**(data | {"tensors": tensors}))
+    if has_resets:  # makes the tensors unaligned
+        message = bytes((1, message[1] | HAS_RESETS)) + message[2:16] + bytes(data["rows"]) + message[16:]
+    read = parse_request(message, MAX_ROWS)
+    assert {name: getattr(read, name) for name in data.keys() - {"tensors"}}.items() <= data.items()
+    assert (read.resets is not None) == has_resets
+    found = codec.read(read)
+    assert list(found) == names
+    for name, tensor in zip(names, tensors, strict=True):
+        np.testing.assert_array_equal(found[name], tensor)
+        assert found[name].dtype == tensor.dtype
+        assert found[name].flags.aligned
+
+
+@given(resets=st.lists(st.booleans(), min_size=1, max_size=MAX_ROWS))
+def test_resets_are_parsed(policies: dict[str, LoadedPolicy], resets: list[bool]) -> None:
+    rows = len(resets)
+    observation = np.arange(rows, dtype="<f4").reshape(rows, 1)
+    message = REQUEST.pack(1, HAS_RESETS, 0, rows, 0) + bytes(resets) + observation.tobytes()
+    read = parse_request(message, MAX_ROWS)
+    assert read.resets is not None
+    assert read.resets.tolist() == resets
+    np.testing.assert_array_equal(BinaryCodec(policies["memory"]).read(read)["observation"], observation)
+
+
+@given(rows=st.integers(1, MAX_ROWS), version=st.integers(1, 2**32 - 1), data=st.data())
+def test_replies_contain_the_actions(
+    policies: dict[str, LoadedPolicy], rows: int, version: int, data: st.DataObject
+) -> None:
+    for league, dtype, shape in (("board", "<i8", (rows,)), ("vector", "<f4", (rows, 2))):
+        numbers = {"allow_nan": False} if dtype == "<f4" else {}
+        actions = data.draw(any_array(np.dtype(dtype), shape, elements=from_dtype(np.dtype(dtype), **numbers)))
+        reply = BinaryCodec(policies[league]).write(actions, version)
+        assert RESPONSE.unpack_from(reply) == (1, 0, 0, rows, version, 0)
+        np.testing.assert_array_equal(np.frombuffer(reply, dtype, offset=16).reshape(shape), actions)
+
+
+def test_a_header_has_the_documented_layout() -> None:
+    message = encode_request([np.array([1, 2], "<u2")], 2, seed=0x0102030405060708, explore=True, reset=True)
+    assert message.hex(" ") == "01 07 00 00 02 00 00 00 08 07 06 05 04 03 02 01 01 00 02 00"
+
+
+def test_bytes_of_a_boolean_are_0_and_1(policies: dict[str, LoadedPolicy]) -> None:
+    planes, mask = np.zeros((1, 8, 8, 111), np.uint8), np.ones((1, 4672), np.int8)
+    codec = BinaryCodec(policies["chess"])
+    codec.read(parse_request(encode_request([planes, mask], 1), MAX_ROWS))
+    planes[0, 3, 3, 3] = 2
+    with pytest.raises(ObservationError, match="other than 0 and 1"):
+        codec.read(parse_request(encode_request([planes, mask], 1), MAX_ROWS))
+
+
+@pytest.fixture
+def policy(storage: Storage) -> Iterator[LoadedPolicy]:
+    """A policy of its own: a run that is too slow changes it."""
+    registry = Registry.open(storage)
+    policy = load(registry, "board", 1, 0.0, ActionSelections()).policy("shared")
+    policy.inline_rows = 64  # however fast the machine is
+    policy.inline_policy = policy.policy.within(60.0)
+    yield policy
+    registry.close()
+
+
+@pytest.fixture
+def batches(policy: LoadedPolicy, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The number of rows of each of its runs."""
+    rows = list[int]()
+    act = policy.inline_policy.act
+
+    def counted(observations: Arrays, **options: Any) -> Actions:
+        rows.append(len(observations["action_mask"]))
+        return act(observations, **options)
+
+    monkeypatch.setattr(policy.inline_policy, "act", counted)
+    return rows
+
+
+async def together(policy: LoadedPolicy, messages: list[Arrays], explore: bool = False) -> list[Any]:
+    """What messages of one turn are answered, as the protocol of their connections awaits it."""
+    waiting, outcomes, loop = StreamBatches(), [None] * len(messages), asyncio.get_running_loop()
+    for index, observations in enumerate(messages):
+        rows = len(observations["action_mask"])
+        steps = waiting.act(policy, observations, rows, explore).__await__()
+
+        def go_on(outcome: Any, steps: Any = steps, index: int = index) -> None:
+            try:
+                steps.throw(outcome) if isinstance(outcome, Exception) else steps.send(outcome)
+                outcomes[index] = "awaits a thread"
+            except StopIteration as done:
+                outcomes[index] = done.value.actions.tolist()
+            except Exception as error:
+                outcomes[index] = error
+
+        steps.send(None).later(loop, go_on)
+    await asyncio.sleep(0)
+    assert None not in outcomes
+    return outcomes
+
+
+def test_messages_of_one_turn_are_one_batch(policy: LoadedPolicy, batches: list[int]) -> None:
+    messages = [board_arrays(boards(8)[:rows]) for rows in (1, 3, 8, 1)]
+    expected = [policy.inline_policy.act(message).actions.tolist() for message in messages]
+    batches.clear()
+    assert asyncio.run(together(policy, messages)) == expected
+    assert batches == [13]
+    assert len({action for actions in expected for action in actions}) > 1
+
+
+def test_a_batch_has_at_most_the_rows_of_the_event_loop(policy: LoadedPolicy, batches: list[int]) -> None:
+    policy.inline_rows = 4
+    messages = [board_arrays(boards(8)[:rows]) for rows in (3, 2, 2, 4, 1)]
+    asyncio.run(together(policy, messages))
+    assert batches == [3, 4, 4, 1]
+
+
+def test_sampled_actions_are_drawn_for_each_row(policy: LoadedPolicy, batches: list[int]) -> None:
+    one = board_arrays([BOARD])
+    actions = asyncio.run(together(policy, [one] * 100, explore=True))
+    assert batches == [64, 36]
+    assert len({action for (action,) in actions}) > 1
+    assert all(BOARD["action_mask"][action] for (action,) in actions)
+
+
+def test_an_error_is_that_of_its_message(policy: LoadedPolicy, batches: list[int]) -> None:
+    one = board_arrays([BOARD])
+    expected = policy.inline_policy.act(one).actions.tolist()
+    wrong = one | {"observation": one["observation"].astype(np.float32)}
+    first, second, third = asyncio.run(together(policy, [one, wrong, one]))
+    assert first == third == expected
+    assert isinstance(second, ObservationError)
+
+
+def test_messages_of_a_slow_policy_run_in_threads(policy: LoadedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_out_of_time(*_: Any, **__: Any) -> None:
+        monkeypatch.undo()
+        raise GraphTimeout("too slow")
+
+    monkeypatch.setattr(policy.inline_policy, "act", run_out_of_time)
+    assert asyncio.run(together(policy, [board_arrays([BOARD])] * 100)) == ["awaits a thread"] * 100, (
+        "of later batches, too"
+    )
+    assert policy.inline_rows == 0

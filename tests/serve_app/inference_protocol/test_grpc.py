@@ -1,4 +1,4 @@
-"""gRPC without a client library: tensors in the fields of their datatype, and invalid messages."""
+"""gRPC without a client library: tensors in the fields of their datatype, invalid messages, and local peers."""
 
 import gc
 import os
@@ -7,19 +7,24 @@ import sys
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
+from unittest.mock import Mock
 
 import grpc
 import numpy as np
 import pytest
+from google.protobuf.message import DecodeError
 from hypothesis import given
 from hypothesis import strategies as st
 
+from league.errors import BodyTooLarge
 from league.registry.registry import Registry
 from league.settings import Storage
+from serve_app.access.errors import MalformedBody
 from serve_app.app import Replica
 from serve_app.inference_protocol import grpc_handlers, grpc_service
 from serve_app.inference_protocol import open_inference_pb2 as messages
-from serve_app.inference_protocol.grpc_service import CONTENTS
+from serve_app.inference_protocol.field_count import MAX_FIELDS, check_fields
+from serve_app.inference_protocol.grpc_service import CONTENTS, is_local_peer
 from serve_app.runtime.timeouts import run_within
 from tests.support.clients.protocol_observations import observations, policy_of
 from tests.support.examples import examples
@@ -49,11 +54,16 @@ def call(replica: InProcess) -> Iterator[Call]:
         yield call
 
 
-def error_of(call: Call, request: Any, rpc: str = "ModelInfer") -> str:
+def status_of(call: Call, request: Any, rpc: str = "ModelInfer") -> tuple[grpc.StatusCode, str]:
     with pytest.raises(grpc.RpcError) as caught:
         call(rpc, request)
-    assert caught.value.code() in CLIENT_ERRORS, caught.value  # type: ignore[attr-defined]
-    return str(caught.value.details())  # type: ignore[attr-defined]
+    return caught.value.code(), str(caught.value.details())  # type: ignore[attr-defined]
+
+
+def error_of(call: Call, request: Any, rpc: str = "ModelInfer") -> str:
+    code, message = status_of(call, request, rpc)
+    assert code in CLIENT_ERRORS, message
+    return message
 
 
 def vector(**changes: Any) -> messages.ModelInferRequest:
@@ -67,32 +77,24 @@ def test_tensors_in_the_field_of_their_datatype(call: Call, leagues: Storage) ->
     policy, signature = policy_of(leagues, "kinds")
     arrays = observations(signature, 2)
     # FP16 has no field, and raw contents must be given for all inputs or for none.
-    without = [name for name in arrays if signature.inputs[name].datatype != "FP16"]
-    assert len(without) == len(DTYPES) - 1
-    inputs = [
-        Input(
-            name=name,
-            datatype=signature.inputs[name].datatype,
-            shape=arrays[name].shape,
-            contents={CONTENTS[signature.inputs[name].datatype]: arrays[name].ravel().tolist()},
-        )
-        for name in without
+    tensors = [
+        Input(name=name, datatype=datatype, shape=arrays[name].shape, contents=contents)
+        for name, port in signature.inputs.items()
+        if (datatype := port.datatype) != "FP16"
+        for contents in [{CONTENTS[datatype]: arrays[name].ravel().tolist()}]
     ]
+    assert len(tensors) == len(DTYPES) - 1
     half = Input(name="observation.float16", datatype="FP16", shape=[2, 2, 3])
-    request = messages.ModelInferRequest(model_name="kinds", inputs=[*inputs, half])
+    request = messages.ModelInferRequest(model_name="kinds", inputs=[*tensors, half])
     assert "send it as bytes" in error_of(call, request)
     del request.inputs[-1]
     assert "input observation.float16 is missing" in error_of(call, request)
+    request.inputs.append(half)
     for tensor in request.inputs:
         tensor.ClearField("contents")
-    request.inputs.append(half)
-    request.raw_input_contents.extend(
-        [*(arrays[name].tobytes() for name in without), arrays["observation.float16"].tobytes()]
-    )
-    answer = call("ModelInfer", request)
-    np.testing.assert_array_equal(
-        np.frombuffer(answer.raw_output_contents[0], np.float32).reshape(2, -1), policy.act(arrays).actions
-    )
+        request.raw_input_contents.append(arrays[tensor.name].tobytes())
+    actions = np.frombuffer(call("ModelInfer", request).raw_output_contents[0], np.float32)
+    np.testing.assert_array_equal(actions.reshape(2, -1), policy.act(arrays).actions)
 
 
 def test_outputs_are_raw_contents(call: Call) -> None:
@@ -107,56 +109,42 @@ def test_outputs_are_raw_contents(call: Call) -> None:
     assert answer.raw_output_contents[0] == np.array([0.5, -1], "<f4").tobytes()
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
+def test_an_invalid_request_is_rejected(call: Call, replica: InProcess, subtests: pytest.Subtests) -> None:
+    for changes, message in (
         ({"contents": {"fp32_contents": [1]}}, "has 1 elements, expected 2"),
         ({"contents": {"fp64_contents": [1, 2]}}, "has 0 elements, expected 2"),
         ({"contents": None}, "has 0 elements, expected 2"),
-        ({"datatype": "FP64"}, "has datatype FP64, expected FP32"),
         ({"datatype": ""}, "datatype ''"),
-        ({"shape": [2]}, "has shape [2], expected [batch, 2]"),
         ({"shape": [-1, 2]}, "has shape [-1, 2]"),
-        ({"name": "other"}, "unknown input 'other'"),
         ({"contents": {"fp32_contents": [float("nan"), 0]}}, "finite"),
-    ],
-)
-def test_an_invalid_tensor_is_rejected(call: Call, changes: dict[str, Any], message: str) -> None:
-    assert message in error_of(call, vector(**changes))
-
-
-def test_raw_contents_are_for_all_inputs_or_for_none(call: Call) -> None:
+    ):
+        with subtests.test(changes=changes):
+            assert message in error_of(call, vector(**changes))
     request = vector()
-    request.raw_input_contents.append(bytes(8))
-    assert "both contents and raw_input_contents" in error_of(call, request)
-    request.inputs[0].ClearField("contents")
-    request.raw_input_contents.append(bytes(8))
-    assert "2 raw_input_contents for 1 inputs" in error_of(call, request)
-    del request.raw_input_contents[:]
-    request.raw_input_contents.append(bytes(7))
-    assert "has 7 bytes, expected 8" in error_of(call, request)
-
-
-def test_a_large_message_is_rejected(call: Call, replica: InProcess) -> None:
-    request = messages.ModelInferRequest(model_name="vector", raw_input_contents=[bytes(600 * 1024)])
-    assert "larger than 524288 bytes" in error_of(call, request)
-
-
-@pytest.mark.parametrize(
-    ("part", "message"),
-    [(b"\x2a\0", "inputs"), (b"\x32\0", "outputs"), (b"\x3a\0", "raw_input_contents")],
-)
-def test_more_tensors_than_those_of_the_policy_are_rejected(call: Call, part: bytes, message: str) -> None:
-    request = messages.ModelInferRequest(model_name="vector").SerializeToString()
-    assert f"the request has 5000 {message}, expected at most" in error_of(call, request + 5000 * part)
-    assert "more than 10000 fields" in error_of(call, request + 200_000 * part)
-
-
-def test_a_call_without_a_message_is_refused(replica: InProcess) -> None:
-    with grpc.insecure_channel(replica.grpc) as channel:
-        infer = channel.stream_unary(f"/{grpc_handlers.SERVICE}/ModelInfer")
-        with pytest.raises(grpc.RpcError) as caught:
-            infer(iter([]))
+    for contents, message in (
+        ([bytes(8)], "both contents and raw_input_contents"),
+        ([bytes(8)] * 2, "2 raw_input_contents for 1 inputs"),
+        ([bytes(7)], "has 7 bytes, expected 8"),
+    ):
+        with subtests.test(contents=contents):
+            del request.raw_input_contents[:]
+            request.raw_input_contents.extend(contents)
+            assert message in error_of(call, request)
+        request.inputs[0].ClearField("contents")
+    large = messages.ModelInferRequest(model_name="vector", raw_input_contents=[bytes(600 * 1024)])
+    assert "larger than 524288 bytes" in error_of(call, large)
+    empty = messages.ModelInferRequest(model_name="vector").SerializeToString()
+    for part, what in ((b"\x2a\0", "inputs"), (b"\x32\0", "outputs"), (b"\x3a\0", "raw_input_contents")):
+        with subtests.test(what):
+            assert f"the request has 5000 {what}, expected at most" in error_of(call, empty + 5000 * part)
+            assert "more than 10000 fields" in error_of(call, empty + 200_000 * part)
+    for rpc, query, code in (
+        ("ModelStatistics", messages.ModelStatisticsRequest(name="nobody"), grpc.StatusCode.NOT_FOUND),
+        ("ModelInfer", messages.ModelInferRequest(model_name="empty"), grpc.StatusCode.UNAVAILABLE),
+    ):
+        assert status_of(call, query, rpc)[0] == code
+    with grpc.insecure_channel(replica.grpc) as channel, pytest.raises(grpc.RpcError) as caught:
+        channel.stream_unary(f"/{grpc_handlers.SERVICE}/ModelInfer")(iter([]))
     assert caught.value.code() in CLIENT_ERRORS  # type: ignore[attr-defined]
 
 
@@ -185,15 +173,6 @@ def test_the_number_of_concurrent_calls_is_limited(
     assert "in progress in this replica" in error_of(call, vector())
 
 
-def test_unknown_models_and_missing_champions_are_reported(call: Call) -> None:
-    with pytest.raises(grpc.RpcError) as caught:
-        call("ModelStatistics", messages.ModelStatisticsRequest(name="nobody"))
-    assert caught.value.code() == grpc.StatusCode.NOT_FOUND  # type: ignore[attr-defined]
-    with pytest.raises(grpc.RpcError) as caught:
-        call("ModelInfer", messages.ModelInferRequest(model_name="empty"))
-    assert caught.value.code() == grpc.StatusCode.UNAVAILABLE  # type: ignore[attr-defined]
-
-
 def test_remote_calls_are_rejected(replica: InProcess) -> None:
     """The port listens on all interfaces, like Ray Serve's; this replica is known as 127.0.0.1."""
     external, port = external_address(), replica.grpc.rpartition(":")[2]
@@ -208,22 +187,16 @@ def test_remote_calls_are_rejected(replica: InProcess) -> None:
 
 def test_a_process_without_a_replica_is_unavailable(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(grpc_handlers, "_service", None)
-    with pytest.raises(grpc.RpcError, match="this process has no replica") as caught:
-        call("ServerLive", messages.ServerLiveRequest())
-    assert caught.value.code() == grpc.StatusCode.UNAVAILABLE  # type: ignore[attr-defined]
+    code, message = status_of(call, messages.ServerLiveRequest(), "ServerLive")
+    assert (code, "this process has no replica" in message) == (grpc.StatusCode.UNAVAILABLE, True)
 
 
 def test_an_unexpected_exception_is_only_logged(
     call: Call, replica: InProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail() -> None:
-        raise ZeroDivisionError("secret")
-
-    monkeypatch.setattr(replica.server.catalogue, "server", fail)
-    with pytest.raises(grpc.RpcError) as caught:
-        call("ServerMetadata", messages.ServerMetadataRequest())
-    assert caught.value.code() == grpc.StatusCode.INTERNAL  # type: ignore[attr-defined]
-    assert "secret" not in caught.value.details()  # type: ignore[attr-defined]
+    monkeypatch.setattr(replica.server.catalogue, "server", Mock(side_effect=ZeroDivisionError("secret")))
+    code, message = status_of(call, messages.ServerMetadataRequest(), "ServerMetadata")
+    assert (code, "secret" in message) == (grpc.StatusCode.INTERNAL, False)
 
 
 def external_address() -> str | None:
@@ -237,34 +210,30 @@ def external_address() -> str | None:
     return None if address.startswith("127.") else address
 
 
-names = st.sampled_from(["observation", "action_mask", "state_in_0"]) | st.text(max_size=5)
+tensors = st.builds(
+    Input,
+    name=st.sampled_from(["observation", "action_mask", "state_in_0"]) | st.text(max_size=5),
+    datatype=st.sampled_from([*CONTENTS, "FP16", "BYTES"]) | st.text(max_size=4),
+    shape=st.lists(st.integers(-1, 3) | st.just(2**62), max_size=4),
+    parameters=st.dictionaries(st.text(max_size=2), st.builds(messages.InferParameter, int64_param=st.integers(0, 9))),
+    contents=st.none()
+    | st.builds(
+        messages.InferTensorContents,
+        fp32_contents=st.lists(st.floats(width=32), max_size=4),
+        int_contents=st.lists(st.integers(-(2**31), 2**31 - 1), max_size=4),
+        bool_contents=st.lists(st.booleans(), max_size=4),
+    ),
+)
+outputs = st.builds(
+    messages.ModelInferRequest.InferRequestedOutputTensor,
+    name=st.sampled_from(["action", "action_dist_inputs"]) | st.text(max_size=5),
+)
 requests = st.builds(
     messages.ModelInferRequest,
     model_name=st.sampled_from(["board", "vector", "memory", "nested", "chess", "duo", "duo.left"]),
     model_version=st.sampled_from(["", "1", "champion", "99", "x y"]),
-    inputs=st.lists(
-        st.builds(
-            Input,
-            name=names,
-            datatype=st.sampled_from([*CONTENTS, "FP16", "BYTES"]) | st.text(max_size=4),
-            shape=st.lists(st.integers(-1, 3) | st.just(2**62), max_size=4),
-            contents=st.none()
-            | st.builds(
-                messages.InferTensorContents,
-                fp32_contents=st.lists(st.floats(width=32), max_size=4),
-                int_contents=st.lists(st.integers(-(2**31), 2**31 - 1), max_size=4),
-                bool_contents=st.lists(st.booleans(), max_size=4),
-            ),
-        ),
-        max_size=3,
-    ),
-    outputs=st.lists(
-        st.builds(
-            messages.ModelInferRequest.InferRequestedOutputTensor,
-            name=st.sampled_from(["action", "action_dist_inputs"]) | st.text(max_size=5),
-        ),
-        max_size=3,
-    ),
+    inputs=st.lists(tensors, max_size=3),
+    outputs=st.lists(outputs, max_size=3),
     raw_input_contents=st.lists(st.binary(max_size=100), max_size=3),
 )
 
@@ -302,3 +271,88 @@ def test_rejected_messages_are_released_at_once(call: Call, monkeypatch: pytest.
 def references(received: list[bytes]) -> list[int]:
     """The number of references to each message."""
     return [sys.getrefcount(message) for message in received]
+
+
+def test_local_and_remote_peers() -> None:
+    here = [
+        "ipv4:127.0.0.1:4711",
+        "ipv4:127.8.0.1:4711",
+        "ipv6:[::1]:4711",
+        "ipv6:%5B::1%5D:4711",
+        "ipv6:[::ffff:127.0.0.1]:4711",
+        "ipv4:192.0.2.1:4711",
+        "ipv6:[::ffff:192.0.2.1]:4711",
+        "unix:",
+        "unix:/run/socket",
+    ]
+    elsewhere = ["ipv4:192.0.2.2:4711", "ipv6:[2001:db8::1]:4711", "ipv6:[::ffff:192.0.2.2]:4711"]
+    for peer in (*here, *elsewhere, "ipv4:127.0.0.1", "", "localhost"):
+        assert is_local_peer(peer, "192.0.2.1") is (peer in here), peer
+
+
+INPUTS, OUTPUTS, PARAMETERS, RAW, UNKNOWN, GROUP = b"\x2a\0", b"\x32\0", b"\x22\0", b"\x3a\0", b"\x78\1", b"\x0b\x0c"
+
+
+def field(number: int, content: bytes) -> bytes:
+    """A field with a length, as the wire format encodes it."""
+    return (
+        messages.ModelInferRequest(raw_input_contents=[content])
+        .SerializeToString()
+        .replace(b"\x3a", bytes([number << 3 | 2]), 1)
+    )
+
+
+def test_messages_with_many_fields_are_too_large() -> None:
+    for body in (
+        *(MAX_FIELDS * part for part in (INPUTS, OUTPUTS, PARAMETERS, RAW, UNKNOWN, GROUP)),
+        field(5, MAX_FIELDS * PARAMETERS),
+        field(5, MAX_FIELDS * b"\x18\1"),  # dimensions
+        field(5, field(5, MAX_FIELDS * b"\x42\0")),  # elements of bytes_contents
+        field(5, field(5, MAX_FIELDS * b"\x18\1")),  # elements of int64_contents, not packed
+        field(6, MAX_FIELDS * b"\x12\0"),
+        field(4, field(2, MAX_FIELDS * b"\x10\1")),
+    ):
+        with pytest.raises(BodyTooLarge, match=f"more than {MAX_FIELDS} fields"):
+            check_fields(body + UNKNOWN, messages.ModelInferRequest.DESCRIPTOR)
+
+
+PADDING = field(3, bytes(MAX_FIELDS))
+
+
+def test_messages_that_are_cut_off_are_malformed() -> None:
+    for cut in (
+        11 * b"\xff",  # an integer
+        b"\x2a",  # a length
+        b"\x2a\2\0",  # content
+        b"\x0d\0",  # 32 bits
+        b"\x09\0",  # 64 bits
+        b"\x0f\0",  # a wire type
+        field(5, b"\x0a\7name"),  # inner content
+    ):
+        with pytest.raises(DecodeError):
+            messages.ModelInferRequest.FromString(PADDING + cut)
+        with pytest.raises(MalformedBody, match="not a valid ModelInferRequest"):
+            check_fields(PADDING + cut, messages.ModelInferRequest.DESCRIPTOR)
+
+
+def test_a_large_message_with_few_fields_passes() -> None:
+    contents = messages.InferTensorContents(int64_contents=[1] * 1_000_000)
+    inputs = [Input(name="x", datatype="INT64", shape=[1000, 1000], contents=contents)]
+    check_fields(
+        messages.ModelInferRequest(model_name="m", inputs=inputs).SerializeToString(),
+        messages.ModelInferRequest.DESCRIPTOR,
+    )
+    check_fields(
+        messages.ModelInferRequest(raw_input_contents=[bytes(4_000_000)]).SerializeToString(),
+        messages.ModelInferRequest.DESCRIPTOR,
+    )
+
+
+@given(message=requests, damage=st.binary(max_size=8))
+def test_no_message_that_the_parser_accepts_is_malformed(message: Any, damage: bytes) -> None:
+    body = PADDING + message.SerializeToString() + damage
+    try:
+        messages.ModelInferRequest.FromString(body)
+    except DecodeError:
+        return
+    check_fields(body, messages.ModelInferRequest.DESCRIPTOR)

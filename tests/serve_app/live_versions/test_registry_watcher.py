@@ -25,7 +25,7 @@ from league.registry.storage.tables import ReplicaTable
 from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.runtime.replica_process import this_process
-from tests.support.clients.actions import BOARD, act
+from tests.support.clients.actions import BOARD, act, version_for
 from tests.support.databases import on_both_databases
 from tests.support.leagues.served_leagues import BOARD as SPACES
 from tests.support.leagues.served_leagues import promote, publish, register
@@ -37,36 +37,30 @@ pytestmark = on_both_databases
 
 
 def acknowledgement(registry: Registry, league: str = "board") -> Acknowledgement | None:
-    found = registry.replicas.acknowledgements(league)
-    return found[0] if found and found[0].event else None
+    return next((row for row in registry.replicas.acknowledgements(league) if row.event), None)
 
 
 def serves(registry: Registry, version: int) -> bool:
     return (row := acknowledgement(registry)) is not None and row.version == version
 
 
-def test_a_started_replica_serves_and_has_acknowledged(client: TestClient, registry: Registry) -> None:
-    until(lambda: serves(registry, 1))
-    row = acknowledgement(registry)
-    assert row is not None
-    assert (row.replica, row.sha256, row.fault) == ("replica-1", registry.versions.get("board", 1).sha256, None)
-    assert acknowledgement(registry, "headless") is None
-    assert client.get("/v1/health/ready").status_code == 200
-
-
-def test_a_promotion_is_acknowledged_once_it_is_served(client: TestClient, registry: Registry) -> None:
-    for version in (2, 3, 2):
-        promote(registry, "board", version)
-        until(lambda version=version: serves(registry, version))
-        assert act(client, observation=BOARD)["version"] == version
-
-
-def test_a_rollback_is_followed(client: TestClient, registry: Registry) -> None:
-    promote(registry, "board", 3)
-    until(lambda: serves(registry, 3))
-    registry.aliases.rollback("board", actor="test", reason="test")
-    until(lambda: serves(registry, 1))
-    assert act(client, observation=BOARD)["version"] == 1
+def test_a_replica_serves_and_acknowledges_what_the_registry_says(registry: Registry) -> None:
+    with replica(registry.storage) as client:
+        until(lambda: serves(registry, 1))
+        row = acknowledgement(registry)
+        assert row is not None
+        assert (row.replica, row.sha256, row.fault) == ("replica-1", registry.versions.get("board", 1).sha256, None)
+        assert acknowledgement(registry, "headless") is None
+        assert client.get("/v1/health/ready").status_code == 200
+        until(lambda: (again := acknowledgement(registry)) and again.seen_at > row.seen_at)
+        for version in (2, 3, 2):
+            promote(registry, "board", version)
+            until(lambda version=version: serves(registry, version))
+            assert act(client, observation=BOARD)["version"] == version
+        registry.aliases.rollback("board", actor="test", reason="test")
+        until(lambda: serves(registry, 3))
+        assert act(client, observation=BOARD)["version"] == 3
+    assert acknowledgement(registry) is None
 
 
 def test_a_version_of_a_league_that_was_removed_and_trained_again_is_served(
@@ -96,34 +90,11 @@ def test_removed_and_retired_versions_in_memory_are_not_served(client: TestClien
 
 
 def test_the_canary_ends_when_its_version_is_removed(client: TestClient, registry: Registry) -> None:
-    def version() -> int:
-        reply = client.post("/v1/policies/board/action", json={"observation": BOARD}, headers={"x-league-key": "p"})
-        return int(reply.json()["version"])
-
     registry.traffic.set("board", canary=Portion(3, 1.0), actor="test", reason="test")
-    until(lambda: version() == 3)
+    until(lambda: version_for(client, "p") == 3)
     registry.removal.remove_version(CheckpointRef("board", 3), force=True)
-    until(lambda: version() == 1)
+    until(lambda: version_for(client, "p") == 1)
     until(lambda: (row := acknowledgement(registry)) and row.fault is None)
-
-
-@pytest.mark.usefixtures("client")
-def test_a_replica_acknowledges_repeatedly(registry: Registry) -> None:
-    until(lambda: acknowledgement(registry))
-
-    def seen_at() -> datetime:
-        row = acknowledgement(registry)
-        assert row is not None
-        return row.seen_at
-
-    first = seen_at()
-    until(lambda: seen_at() > first)
-
-
-def test_a_stopped_replica_is_deleted(registry: Registry) -> None:
-    with replica(registry.storage):
-        until(lambda: acknowledgement(registry))
-    assert acknowledgement(registry) is None
 
 
 def test_a_tampered_champion_is_reported(client: TestClient, registry: Registry) -> None:
@@ -139,6 +110,11 @@ def test_a_tampered_champion_is_reported(client: TestClient, registry: Registry)
     assert act(client, observation=BOARD)["version"] == 1
     reply = client.post("/v1/policies/board/action?version=2", json={"observation": BOARD})
     assert (reply.status_code, reply.json()["code"]) == (503, "artifact_corrupt")
+    event = registry.aliases.rollback("board", actor="test", reason="test")
+    assert registry.changes.wait_for_alias(event, 30) == ["replica-1"]
+    row = acknowledgement(registry)
+    assert row is not None
+    assert (row.version, row.fault) == (1, None), "the fault ends with the difference from the registry"
 
 
 def test_serving_continues_without_the_database(registry: Registry) -> None:
@@ -187,9 +163,12 @@ def test_serving_continues_without_the_artifacts(client: TestClient, registry: R
 def test_an_empty_registry_replacing_the_followed_one_is_ignored(
     registry: Registry, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """It has no keys, which would unlock the server."""
     if is_server(registry):
         pytest.skip("a database that is a file can be replaced")
+    _, token = registry.keys.create("bot", ["act", "read"])
     with replica(registry.storage) as client:
+        client.headers["x-api-key"] = token
         assert act(client, observation=BOARD)["version"] == 1
         Registry.open(Storage.at(tmp_path / "other")).close()
         home = registry.storage.home
@@ -198,6 +177,7 @@ def test_an_empty_registry_replacing_the_followed_one_is_ignored(
         until(lambda: "it is a different database" in caplog.text)
         assert client.get("/v1/leagues").json() == {"leagues": [], "next": None}
         assert act(client, observation=BOARD)["version"] == 1
+        assert client.get("/v1/leagues", headers={"x-api-key": ""}).status_code == 401
         shutil.rmtree(home)
         (tmp_path / "away").rename(home)
         promote(registry, "board", 2)
@@ -215,7 +195,7 @@ def backdate(registry: Registry, replica: str, seconds: float) -> None:
 
 
 def names(registry: Registry) -> set[str]:
-    return {each.replica for each in registry.replicas.registered()}
+    return {row.replica for row in registry.replicas.registered()}
 
 
 def test_a_replica_registers_before_it_reads_the_aliases(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,19 +267,6 @@ def test_a_replica_that_was_taken_for_dead_registers_and_acknowledges_again(regi
         until(lambda: (row := acknowledgement(registry, "vector")) and row.fault)
         promote(registry, "board", 2)
         until(lambda: serves(registry, 2))
-
-
-def test_a_failure_is_forgotten_after_a_rollback(registry: Registry) -> None:
-    """What a replica says of a league where it differs from the registry ends with the difference."""
-    (registry.artifacts.path("board", 2) / "shared.onnx").write_bytes(b"tampered")
-    with replica(registry.storage):
-        promote(registry, "board", 2)
-        until(lambda: (row := acknowledgement(registry)) and row.fault)
-        event = registry.aliases.rollback("board", actor="test", reason="test")
-        assert registry.changes.wait_for_alias(event, 30) == ["replica-1"]
-        row = acknowledgement(registry)
-        assert row is not None
-        assert (row.version, row.fault) == (1, None)
 
 
 def named(storage: Storage, name: str) -> Storage:

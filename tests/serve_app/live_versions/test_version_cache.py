@@ -1,18 +1,31 @@
-"""Versions in memory: concurrent requests load a version once, and pinned versions are not evicted."""
+"""Versions in memory: loaded once, not evicted while pinned, and kept if the new version of an alias is invalid."""
 
 import asyncio
+import os
 import threading
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from functools import partial
+from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from league.errors import ArtifactCorrupt, Overloaded, StorageError
+from league.registry.registry import Registry
 from league.registry.storage.manifest import Member, Mixture
 from league.registry.storage.rows import VersionState
-from serve_app.live_versions.version_cache import MAX_REQUESTED, LoadedVersion, VersionCache
+from serve_app.live_versions.alias_slots import Alias, AliasSlots
+from serve_app.live_versions.version_cache import MAX_REQUESTED, ActionSelections, LoadedVersion, VersionCache, load
+from serve_app.runtime.ray_serve import logger
+from tests.support.leagues.served_leagues import publish
+from tests.support.policies.graphs import masked_mlp
+from tests.support.policies.probes import probes
 
 pytestmark = pytest.mark.anyio
+
+
+DEADLINE = 30
 
 
 class Loader:
@@ -28,7 +41,7 @@ class Loader:
 
     def __call__(self, league: str, number: int) -> LoadedVersion:
         if self.slow is None or number in self.slow:
-            assert self.gate.wait(10)
+            assert self.gate.wait(DEADLINE)
         self.calls[number] += 1
         if number in self.faults:
             raise self.faults[number]
@@ -47,8 +60,8 @@ async def test_concurrent_requests_cause_one_load() -> None:
     await asyncio.sleep(0)
     tasks[0].cancel()
     loader.gate.set()
-    found = await asyncio.gather(*tasks[1:])
-    assert {id(version) for version in found} == {id(versions.cached("board", 1))}
+    loaded = await asyncio.gather(*tasks[1:])
+    assert {id(version) for version in loaded} == {id(versions.cached("board", 1))}
     assert loader.calls == {1: 1}
 
 
@@ -183,3 +196,154 @@ async def until(attempt: Callable[[], Awaitable[LoadedVersion]]) -> LoadedVersio
                 return await attempt()
             except ArtifactCorrupt:
                 await asyncio.sleep(0.01)
+
+
+CHAMPION = ("board", "champion")
+CANDIDATE = ("board", "candidate")
+OTHER = ("vector", "champion")
+
+
+@pytest.fixture
+def versions(registry: Registry) -> VersionCache:
+    return VersionCache(partial(load, registry, inline=0.001, selections=ActionSelections()), capacity=1, retry=0)
+
+
+@pytest.fixture
+def slots(versions: VersionCache) -> AliasSlots:
+    return AliasSlots(versions)
+
+
+def number(slots: AliasSlots, alias: str = "champion") -> int | None:
+    version = slots.get("board", alias)
+    return version and version.number
+
+
+async def follow(slots: AliasSlots, wanted: dict[Alias, int]) -> None:
+    slots.update(wanted)
+    await slots.settle(DEADLINE)
+
+
+def graph(registry: Registry, version: int) -> Path:
+    return registry.artifacts.path("board", version) / "shared.onnx"
+
+
+async def test_slots_follow_their_aliases(slots: AliasSlots, versions: VersionCache) -> None:
+    await follow(slots, {CHAMPION: 1, CANDIDATE: 2})
+    assert (number(slots), number(slots, "candidate")) == (1, 2)
+    await follow(slots, {CHAMPION: 2})
+    assert (number(slots), number(slots, "candidate")) == (2, None)
+    assert slots.champion("board") is versions.cached("board", 2), "the version is loaded once"
+    assert slots.leagues() == ["board"]
+    await follow(slots, {})
+    assert (number(slots), slots.leagues()) == (None, [])
+
+
+async def test_a_tampered_version_does_not_go_live(
+    slots: AliasSlots, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors = Mock()
+    monkeypatch.setattr(logger, "error", errors)
+    await follow(slots, {CHAMPION: 1})
+    content = graph(registry, 2).read_bytes()
+    graph(registry, 2).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    for _ in range(3):
+        await follow(slots, {CHAMPION: 2})
+    assert number(slots) == 1
+    assert "shared.onnx was changed" in slots.faults()["board"]
+    assert errors.call_count == 1, "logged once"
+    graph(registry, 2).write_bytes(content)
+    await follow(slots, {CHAMPION: 2})
+    assert (number(slots), slots.faults()) == (2, {})
+
+
+async def test_a_damaged_version_does_not_go_live(slots: AliasSlots, registry: Registry) -> None:
+    path = graph(registry, 2)
+    manifest = path.with_name("manifest.json")
+    content, text = path.read_bytes(), manifest.read_text()
+    for damage in (
+        lambda: path.write_bytes(content[:100]),
+        lambda: path.write_bytes(b""),
+        lambda: path.write_bytes(graph(registry, 3).read_bytes()),
+        path.unlink,
+        lambda: manifest.write_text(text.replace('"steps": 2', '"steps": 3')),
+        lambda: path.with_name("extra.bin").write_bytes(b"code"),
+    ):
+        await follow(slots, {CHAMPION: 1, OTHER: 1})
+        assert (number(slots), slots.faults()) == (1, {}), "going back clears the fault"
+        damage()
+        await follow(slots, {CHAMPION: 2, OTHER: 1})
+        assert (number(slots), slots.faults().keys()) == (1, {"board"})
+        path.write_bytes(content)
+        manifest.write_text(text)
+
+
+async def test_only_the_files_that_are_served_are_read(slots: AliasSlots, registry: Registry) -> None:
+    """The state of training can be as large as a disk is slow."""
+    state = registry.artifacts.path("board", 2) / "training" / "state"
+    state.unlink()
+    os.mkfifo(state)  # reading it would not end
+    await follow(slots, {CHAMPION: 2})
+    assert (number(slots), slots.faults().get("board")) == (2, None)
+
+
+@pytest.mark.parametrize(("recorded_of", "answers"), [(3, True), (4, False)], ids=["matching", "other"])
+async def test_a_version_goes_live_only_if_its_probes_match(
+    slots: AliasSlots, registry: Registry, recorded_of: int, answers: bool
+) -> None:
+    await follow(slots, {CHAMPION: 1})
+    recorded = {"shared": probes(seed=recorded_of)}
+    new = publish(registry, "board", {"shared": masked_mlp(seed=3)}, "run/probed", recorded).number
+    await follow(slots, {CHAMPION: new})
+    assert number(slots) == (new if answers else 1)
+    assert (slots.faults().get("board") is None) == answers
+    assert answers or "probe observations" in str(slots.faults().get("board"))
+
+
+@pytest.fixture
+def stalled() -> Iterator[Loader]:
+    """A loader for which version 2 takes until `gate` opens, as on a disk that does not respond."""
+    loader = Loader()
+    loader.slow = {2}
+    loader.gate.clear()
+    yield loader
+    loader.gate.set()
+
+
+async def test_a_later_update_replaces_a_stalled_load(stalled: Loader) -> None:
+    slots = AliasSlots(VersionCache(stalled, capacity=2, retry=0))
+    await follow(slots, {CHAMPION: 1})
+    slots.update({CHAMPION: 2})
+    await slots.settle(0.01)
+    assert number(slots) == 1
+    await follow(slots, {CHAMPION: 3})
+    assert number(slots) == 3
+    stalled.gate.set()
+    await asyncio.to_thread(stalled.gate.wait)
+    await slots.settle(DEADLINE)
+    assert (number(slots), slots.faults().get("board")) == (3, None), "the version of before does not come back"
+
+
+async def test_a_load_that_takes_too_long_is_a_fault_until_it_succeeds(stalled: Loader) -> None:
+    slots = AliasSlots(VersionCache(stalled, capacity=1, retry=0, timeout=0.5))
+    await follow(slots, {CHAMPION: 1})
+    await follow(slots, {CHAMPION: 2})
+    assert number(slots) == 1
+    assert slots.is_settled
+    assert "board@2 was not loaded within 0.5 s" in (slots.faults().get("board") or "")
+    await follow(slots, {CHAMPION: 2})
+    stalled.gate.set()
+    while number(slots) != 2:
+        await follow(slots, {CHAMPION: 2})
+    assert (slots.faults().get("board"), stalled.calls[2]) == (None, 1), "a stalled thread is not joined"
+
+
+async def test_any_exception_is_a_fault_of_its_alias(registry: Registry) -> None:
+    def exhausted(league: str, number: int) -> LoadedVersion:
+        if number == 2:
+            raise MemoryError
+        return load(registry, league, number, inline=0.001, selections=ActionSelections())
+
+    slots = AliasSlots(VersionCache(exhausted, capacity=1, retry=0))
+    await follow(slots, {CHAMPION: 1, OTHER: 1})
+    await follow(slots, {CHAMPION: 2, OTHER: 1})
+    assert (number(slots), slots.faults()) == (1, {"board": "champion: MemoryError while loading"})

@@ -21,7 +21,7 @@ from serve_app.app import Replica
 from serve_app.routes import plain_action
 from serve_app.routes.plain_action import PlainActions
 from serve_app.runtime.uvicorn_http import HttpProtocol
-from tests.support.clients.actions import BAD_BODIES, BOARD, boards
+from tests.support.clients.actions import BOARD, INVALID, boards
 from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.replicas import QUICK, READ_ONLY
 from tests.support.servers.shadows import set_shadow, wait_for
@@ -55,50 +55,38 @@ def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Connections]:
         yield connections
 
 
-@pytest.mark.parametrize(
-    ("model", "body"),
-    [
-        ("board", {"observation": BOARD}),
-        ("board", {"observations": boards(8)}),
-        ("board.shared", {"observation": BOARD}),
-        ("duo.left", {"observation": BOARD}),
-        ("vector", VECTOR),
-        ("nested", NESTED),
-    ],
-)
-def test_plain_requests_take_the_fast_path(replica: Connections, model: str, body: Any) -> None:
-    count = len(replica.answered)
-    answer = exchange(replica.fast, request(body, model))
-    assert len(replica.answered) == count + 1
-    assert answer.startswith(b"HTTP/1.1 200 OK\r\n")
-    assert answer == exchange(replica.general, request(body, model))
-
-
 SENSES = {
     "observation.mode": np.array([2, 1]),
     "observation.sense.speed": np.array([[1.5, 2], [-1, 0.25]], np.float32),
 }
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        infer(binary_boards(1), outputs=["action"]),
-        infer(binary_boards(8)),
-        infer(binary_boards(1), outputs=["action_dist_inputs", "action"]),
-        infer(binary_boards(1), "board/versions/1"),
-        infer(binary_boards(1), "board.shared/versions/champion"),
-        infer(dict(reversed(SENSES.items())), "nested"),
-        infer(binary_boards(1), more={"Accept-Encoding": "gzip"}),
-    ],
-)
-def test_binary_requests_take_the_fast_path(replica: Connections, data: bytes) -> None:
-    for _ in range(2):  # what the JSON says is known the second time
-        count = len(replica.answered)
-        answer = exchange(replica.fast, data)
-        assert len(replica.answered) == count + 1
-        assert answer.startswith(b"HTTP/1.1 200 OK\r\n")
-        assert answer == exchange(replica.general, data)
+PLAIN: dict[str, bytes] = {
+    "one": request({"observation": BOARD}),
+    "a batch": request({"observations": boards(8)}),
+    "a policy": request({"observation": BOARD}, "board.shared"),
+    "one of two policies": request({"observation": BOARD}, "duo.left"),
+    "a vector": request(VECTOR, "vector"),
+    "nested": request(NESTED, "nested"),
+    "binary, one": infer(binary_boards(1), outputs=["action"]),
+    "binary, a batch": infer(binary_boards(8)),
+    "binary, all outputs": infer(binary_boards(1), outputs=["action_dist_inputs", "action"]),
+    "binary, a version": infer(binary_boards(1), "board/versions/1"),
+    "binary, an alias": infer(binary_boards(1), "board.shared/versions/champion"),
+    "binary, nested": infer(dict(reversed(SENSES.items())), "nested"),
+    "binary, an encoding": infer(binary_boards(1), more={"Accept-Encoding": "gzip"}),
+}
+
+
+def test_plain_requests_take_the_fast_path(replica: Connections, subtests: pytest.Subtests) -> None:
+    for name, data in PLAIN.items():
+        with subtests.test(name):
+            for _ in range(2):  # what the JSON says is known the second time
+                count = len(replica.answered)
+                answer = exchange(replica.fast, data)
+                assert len(replica.answered) == count + 1
+                assert answer.startswith(b"HTTP/1.1 200 OK\r\n")
+                assert answer == exchange(replica.general, data)
 
 
 OTHERS: dict[str, bytes] = {
@@ -125,7 +113,6 @@ OTHERS: dict[str, bytes] = {
     "large": request({"observation": BOARD, "seed": [1] * 20_000}),
     "too large": request({"observation": BOARD, "seed": [1] * 40_000}),
     "booleans": request({"observation": BOARD | {"action_mask": [True] * 7}}),
-    "an infinity": request({"observation": [1e39, 0]}, model="vector"),
     "illegal": request({"observation": BOARD | {"action_mask": [0] * 7}}),
     "binary, a response to compress": infer(
         {"observation": np.zeros((8, 6, 7, 2), np.int8), "action_mask": np.ones((8, 7), np.int8)},
@@ -146,13 +133,14 @@ OTHERS: dict[str, bytes] = {
     "binary, an encoding": infer(binary_boards(1), more={"Content-Encoding": "gzip"}),
     "binary, a wrong length": infer(binary_boards(1), more={"Inference-Header-Content-Length": "soon"}),
     "a duplicate key": request(b'{"observation": [1, 0], "observation": [0, 1]}', model="vector"),
-    **{f"body: {name}": request(body) for name, (body, *_) in BAD_BODIES.items()},
+    **{f"invalid: {name}": request(body, model) for name, (model, body, *_) in INVALID.items()},
 }
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_other_requests_get_the_same_answer(replica: Connections, name: str) -> None:
-    assert exchange(replica.fast, OTHERS[name]) == exchange(replica.general, OTHERS[name])
+def test_other_requests_get_the_same_answer(replica: Connections, subtests: pytest.Subtests) -> None:
+    for name, data in OTHERS.items():
+        with subtests.test(name):
+            assert exchange(replica.fast, data) == exchange(replica.general, data)
 
 
 def test_generated_requests_get_the_same_answers(replica: Connections) -> None:
@@ -309,11 +297,10 @@ def test_an_idle_connection_keeps_no_body(replica: Connections) -> None:
 
 
 def test_a_client_that_is_gone(replica: Connections) -> None:
-    with replica.busy():
-        with socket.create_connection(replica.fast) as connection:
-            connection.sendall(request({"observation": BOARD}))
-        expected = request({"observation": BOARD})
-    assert exchange(replica.fast, expected) == exchange(replica.general, expected)
+    data = request({"observation": BOARD})
+    with replica.busy(), socket.create_connection(replica.fast) as connection:
+        connection.sendall(data)
+    assert exchange(replica.fast, data) == exchange(replica.general, data)
 
 
 def test_keys_and_their_limits_hold(tmp_path: Path) -> None:
@@ -332,7 +319,10 @@ def test_keys_and_their_limits_hold(tmp_path: Path) -> None:
         assert b"x-league-key-accepted: 1" in next(answer for answer in answers if answer[9:12] == b"200")
 
 
-def test_shadow_and_metrics_count(tmp_path: Path) -> None:
+def test_shadows_canaries_and_mixtures(tmp_path: Path) -> None:
+    def requests() -> list[bytes]:
+        return [request({"observation": BOARD}, headers=JSON | {"X-League-Key": name}) for name in "abcdefgh"]
+
     with changing(Storage.at(tmp_path / "home"), AT_ONCE) as (replica, registry):
         set_shadow(registry)
         until(lambda: "board" in replica.server.traffic.shadows)
@@ -343,31 +333,21 @@ def test_shadow_and_metrics_count(tmp_path: Path) -> None:
         counts = wait_for(registry, lambda counts: counts.requests + counts.dropped == 4)
         assert counts.dropped == 0
         assert replica.server.metrics.totals()["action"][0] == 4
-
-
-def test_a_canary_is_asked_by_the_application(tmp_path: Path) -> None:
-    with changing(Storage.at(tmp_path / "home"), AT_ONCE) as (replica, registry):
-        registry.traffic.set("board", canary=Portion(2, 0.5), actor="test", reason="test")
+        registry.traffic.set("board", canary=Portion(2, 0.5), shadow=None, actor="test", reason="test")
         until(lambda: "board" in replica.server.traffic.canaries)
-        for name in "abcdefgh":
-            data = request({"observation": BOARD}, headers=JSON | {"X-League-Key": name})
+        for data in requests():
             assert exchange(replica.fast, data) == exchange(replica.general, data)
-        assert replica.answered == []
+        assert len(replica.answered) == 4, "the application selects a canary"
         exchange(replica.fast, request(VECTOR, "vector"))
-        assert len(replica.answered) == 1, "other leagues have none"
-
-
-def test_members_of_a_mixture_answer_their_callers(tmp_path: Path) -> None:
-    with changing(Storage.at(tmp_path / "home"), AT_ONCE) as (replica, registry):
+        assert len(replica.answered) == 5, "other leagues have none"
+        registry.traffic.set("board", canary=None, actor="test", reason="test")
         promote(registry, "board", registry.publisher.publish_mixture("board", {1: 0.5, 2: 0.5}).number)
         until(lambda: (served := replica.server.alias_slots.champion("board")) is not None and served.members)
-        answers = set()
-        for name in "abcdefgh":
-            data = request({"observation": BOARD}, headers=JSON | {"X-League-Key": name})
-            answers.add(exchange(replica.fast, data))
-            assert exchange(replica.general, data) in answers
-        assert len(answers) == 2
-        assert len(replica.answered) == 8
+        until(lambda: "board" not in replica.server.traffic.canaries)
+        answers = [exchange(replica.fast, data) for data in requests()]
+        assert answers == [exchange(replica.general, data) for data in requests()]
+        assert len(set(answers)) == 2
+        assert len(replica.answered) == 5 + 8
 
 
 def test_a_full_replica_refuses(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,6 +50,12 @@ def connection(server: Listening, key: str, league: str = LEAGUE) -> SimulatorCo
     return SimulatorConnection(Endpoint(server.url, key, None, 60.0), league, NAME, VERSION, 2)
 
 
+def run(server: Listening, key: str, **options: Any) -> None:
+    """Run a simulator of the game."""
+    make = importlib.import_module(CONFIG.environment.entry_point).env
+    simulate(server.url, LEAGUE, lambda: PettingZooGame(make()), name=NAME, version=VERSION, key=key, **options)
+
+
 @pytest.mark.parametrize("binary", [True, False])
 def test_matches_through_the_server_are_those_of_the_game_in_python(
     opened: Registry, server: Listening, tokens: dict[str, str], binary: bool
@@ -56,22 +63,8 @@ def test_matches_through_the_server_are_those_of_the_game_in_python(
     schedule = round_robin(CONFIG, INTERFACE, CONTESTANTS, 2)
     positions = range(schedule.length)
     expected = play_matches(schedule, positions, stock_stepping(CONFIG.environment, 8), INTERFACE, build_roster())
-    make = importlib.import_module(CONFIG.environment.entry_point).env
-
-    def run() -> None:
-        simulate(
-            server.url,
-            LEAGUE,
-            lambda: PettingZooGame(make()),
-            name=NAME,
-            version=VERSION,
-            key=tokens["simulator"],
-            episodes=3,
-            binary=binary,
-            limit=2 * schedule.length,
-        )
-
-    simulator = threading.Thread(target=run, daemon=True)
+    options = {"episodes": 3, "binary": binary, "limit": 2 * schedule.length}
+    simulator = threading.Thread(target=run, args=(server, tokens["simulator"]), kwargs=options, daemon=True)
     simulator.start()  # it waits until something needs episodes
     with closing(stepping(opened)) as environment:
         assert play_matches(schedule, positions, environment, INTERFACE, build_roster()) == expected
@@ -79,24 +72,20 @@ def test_matches_through_the_server_are_those_of_the_game_in_python(
 
 
 def test_a_simulator_needs_a_key_with_its_scope(server: Listening, tokens: dict[str, str]) -> None:
-    for token, status in (("", 401), ("plk_x", 401), (tokens["reader"], 403), (tokens["simulator"], 503)):
-        with pytest.raises(InvalidStatus) as refused:
-            connection(server, token)
-        assert refused.value.response.status_code == status
-    with pytest.raises(InvalidStatus) as refused:
-        connection(server, tokens["simulator"], "nowhere")
-    assert refused.value.response.status_code == 404
-
-
-def test_a_refused_simulator_ends_with_the_error(server: Listening, tokens: dict[str, str]) -> None:
-    refusals: tuple[tuple[str, str, type[LeagueError]], ...] = (
-        ("plk_x", LEAGUE, Unauthenticated),
-        (tokens["reader"], LEAGUE, Forbidden),
-        (tokens["simulator"], "nowhere", UnknownLeague),
+    refusals: tuple[tuple[str, str, int, type[LeagueError] | None], ...] = (
+        ("", LEAGUE, 401, Unauthenticated),
+        ("plk_x", LEAGUE, 401, Unauthenticated),
+        (tokens["reader"], LEAGUE, 403, Forbidden),
+        (tokens["simulator"], "nowhere", 404, UnknownLeague),
+        (tokens["simulator"], LEAGUE, 503, None),  # nothing needs episodes yet
     )
-    for token, league, error in refusals:
-        with pytest.raises(error):
-            simulate(server.url, league, lambda: PettingZooGame(None), name=NAME, version=VERSION, key=token)
+    for token, league, status, error in refusals:
+        with pytest.raises(InvalidStatus) as refused:
+            connection(server, token, league)
+        assert refused.value.response.status_code == status
+        if error is not None:
+            with pytest.raises(error):
+                simulate(server.url, league, lambda: PettingZooGame(None), name=NAME, version=VERSION, key=token)
 
 
 def test_an_invalid_report_is_named_and_a_revoked_key_ends_the_connection(
@@ -123,15 +112,5 @@ def test_an_invalid_report_is_named_and_a_revoked_key_ends_the_connection(
             revoked.receive()
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.code == 1008
-        make = importlib.import_module(CONFIG.environment.entry_point).env
-        simulate(
-            server.url,
-            LEAGUE,
-            lambda: PettingZooGame(make()),
-            name=NAME,
-            version=VERSION,
-            key=tokens["second"],
-            episodes=2,
-            limit=2,
-        )
+        run(server, tokens["second"], episodes=2, limit=2)
         until(lambda: not player.is_alive())

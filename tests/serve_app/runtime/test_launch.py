@@ -1,28 +1,52 @@
-"""Faults are reported in one sentence before Ray starts."""
+"""Faults are reported in one sentence before Ray starts; what bypasses Ray, and the number of replicas."""
 
+import asyncio
+import pickle
 import socket
+import subprocess
+import sys
+from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from ray.serve._private.common import DeploymentID, ReplicaID, TimeStampedValue
+from ray.serve.config import AutoscalingConfig, AutoscalingPolicy
+from starlette.responses import PlainTextResponse
+from starlette.testclient import TestClient
+from starlette.types import Receive, Scope, Send
 
 from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
+from league.registry.replicas import LIVENESS_TIMEOUT
 from league.settings import Storage
-from serve_app.runtime import launch
+from serve_app.runtime import launch, serve_bypass
+from serve_app.runtime.autoscaling import LOAD, MARGIN, STALE, LoadPolicy, required_replicas
 from serve_app.runtime.launch import DEPLOY_YAML, load_document, running
+from serve_app.runtime.replica_process import has_ended, this_process
+from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
+from serve_app.settings import ServeSettings, is_exposed
 from tests.support.waiting import until
 
 
-@pytest.mark.parametrize("which", ["port", "grpc_port"])
-def test_a_port_in_use_is_reported(storage: Storage, which: str) -> None:
+def load(deploy: Path = DEPLOY_YAML, replicas: int | None = None, max_replicas: int | None = None) -> dict[str, Any]:
+    return load_document(deploy, None, None, None, replicas, max_replicas, insecure=False)
+
+
+def test_a_port_in_use_is_reported(storage: Storage) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        with (
-            pytest.raises(AlreadyRunning, match=f"port {port} of 127.0.0.1 is in use"),
-            running(storage, **{which: port}),  # type: ignore[arg-type]
-        ):
-            pass
+        for option in ("port", "grpc_port"):
+            with (
+                pytest.raises(AlreadyRunning, match=f"port {port} of 127.0.0.1 is in use"),
+                running(storage, **{option: port}),  # type: ignore[arg-type]
+            ):
+                pass
 
 
 def test_invalid_settings_are_reported(storage: Storage, tmp_path: Path) -> None:
@@ -32,48 +56,43 @@ def test_invalid_settings_are_reported(storage: Storage, tmp_path: Path) -> None
         pass
 
 
-@pytest.mark.parametrize("text", ["", "applications: []", "http_options: {}", "a: [", "- 1"])
-def test_an_invalid_deploy_yaml_is_reported(tmp_path: Path, text: str) -> None:
+def test_an_invalid_deploy_yaml_is_reported(tmp_path: Path) -> None:
     deploy = tmp_path / "deploy.yaml"
-    deploy.write_text(text)
-    with pytest.raises(ConfigError, match=r"deploy\.yaml"):
-        load_document(deploy, None, None, None, None, None, insecure=False)
-
-
-def test_a_missing_deploy_yaml_is_reported(tmp_path: Path) -> None:
+    impossible = DEPLOY_YAML.read_text().replace("target: 0.6", "target: 60")
+    unreadable = ("", "applications: []", "http_options: {}", "a: [", "- 1")
+    for text, message in (
+        *((text, r"deploy\.yaml") for text in unreadable),
+        (impossible, "target must be greater than 0 and less than 1, got 60"),
+    ):
+        deploy.write_text(text)
+        with pytest.raises(ConfigError, match=message):
+            load(deploy)
     with pytest.raises(ConfigError, match=r"nowhere\.yaml"):
-        load_document(tmp_path / "nowhere.yaml", None, None, None, None, None, insecure=False)
+        load(tmp_path / "nowhere.yaml")
 
 
-def test_an_unusable_home_is_reported(tmp_path: Path) -> None:
+def test_an_unusable_home_and_a_missing_haproxy_are_reported(
+    storage: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").write_text("not a directory")
     with pytest.raises(StorageError, match="file"), running(Storage.at(tmp_path / "file" / "home")):
         pass
+    monkeypatch.setenv("RAY_SERVE_HAPROXY_BINARY_PATH", "/nowhere/haproxy")
+    with pytest.raises(NotReady, match="HAProxy is missing"), running(storage):
+        pass
 
 
-@pytest.mark.parametrize(
-    ("replicas", "max_replicas", "expected"),
-    [(None, None, (2, 2)), (3, None, (3, 3)), (1, 4, (1, 4)), (None, 5, (2, 5))],
-)
-def test_the_options_set_the_bounds_of_the_number_of_replicas(
-    replicas: int | None, max_replicas: int | None, expected: tuple[int, int]
-) -> None:
-    document = load_document(DEPLOY_YAML, None, None, None, replicas, max_replicas, insecure=False)
-    bounds = document["applications"][0]["deployments"][0]["autoscaling_config"]
-    assert (bounds["min_replicas"], bounds["max_replicas"]) == expected
-
-
-@pytest.mark.parametrize(
-    ("replicas", "max_replicas", "message"),
-    [
-        (3, 2, "--max-replicas must be at least 3, as --replicas or min_replicas, got 2"),
-        (None, 1, "--max-replicas must be at least 2, as --replicas or min_replicas, got 1"),
-        (0, 2, "min_replicas must be at least 1, got 0"),
-    ],
-)
-def test_impossible_numbers_of_replicas_are_reported(replicas: int | None, max_replicas: int, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        load_document(DEPLOY_YAML, None, None, None, replicas, max_replicas, insecure=False)
+def test_the_options_set_the_bounds_of_the_number_of_replicas() -> None:
+    for options, expected in (((None, None), (2, 2)), ((3, None), (3, 3)), ((1, 4), (1, 4)), ((None, 5), (2, 5))):
+        bounds = load(DEPLOY_YAML, *options)["applications"][0]["deployments"][0]["autoscaling_config"]
+        assert (bounds["min_replicas"], bounds["max_replicas"]) == expected
+    for options, message in (
+        ((3, 2), "--max-replicas must be at least 3, as --replicas or min_replicas, got 2"),
+        ((None, 1), "--max-replicas must be at least 2, as --replicas or min_replicas, got 1"),
+        ((0, 2), "min_replicas must be at least 1, got 0"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load(DEPLOY_YAML, *options)
 
 
 def test_a_deploy_yaml_may_have_a_fixed_number_of_replicas(tmp_path: Path) -> None:
@@ -83,26 +102,13 @@ def test_a_deploy_yaml_may_have_a_fixed_number_of_replicas(tmp_path: Path) -> No
     deployment["num_replicas"] = 2
     deploy = tmp_path / "deploy.yaml"
     deploy.write_text(yaml.safe_dump(document))
-    loaded = load_document(deploy, None, None, None, 3, None, insecure=False)
+    loaded = load(deploy, 3)
     assert loaded["applications"][0]["deployments"][0]["num_replicas"] == 3
     with pytest.raises(ConfigError, match=r"--max-replicas: deploy\.yaml has num_replicas"):
-        load_document(deploy, None, None, None, None, 3, insecure=False)
+        load(deploy, max_replicas=3)
 
 
-def test_an_impossible_target_is_reported(tmp_path: Path) -> None:
-    deploy = tmp_path / "deploy.yaml"
-    deploy.write_text(DEPLOY_YAML.read_text().replace("target: 0.6", "target: 60"))
-    with pytest.raises(ConfigError, match="target must be greater than 0 and less than 1, got 60"):
-        load_document(deploy, None, None, None, None, None, insecure=False)
-
-
-def test_a_missing_haproxy_is_reported(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RAY_SERVE_HAPROXY_BINARY_PATH", "/nowhere/haproxy")
-    with pytest.raises(NotReady, match="HAProxy is missing"), running(storage):
-        pass
-
-
-def test_a_password_is_in_no_command_line(tmp_path: Path) -> None:
+def test_passwords_reach_neither_command_lines_nor_clusters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     storage = Storage(tmp_path, "postgresql://league:secret@192.0.2.1/league", tmp_path / "artifacts")
     commands = []
 
@@ -113,16 +119,352 @@ def test_a_password_is_in_no_command_line(tmp_path: Path) -> None:
             until(Path(f"/proc/{self.pid}/cmdline").read_text)
             commands.append(Path(f"/proc/{self.pid}/cmdline").read_text())
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(launch, "Subprocess", Recorded)
-        with pytest.raises(ConfigError, match="none"), running(storage, deploy=tmp_path / "none.yaml"):
-            pass
-    (command,) = commands
-    assert "serve_app.runtime.launch" in command
-    assert "secret" not in command
-
-
-def test_a_password_is_not_given_to_a_cluster(tmp_path: Path) -> None:
-    storage = Storage(tmp_path, "postgresql://league:secret@192.0.2.1/league", tmp_path / "artifacts")
+    monkeypatch.setattr(launch, "Subprocess", Recorded)
+    with pytest.raises(ConfigError, match="none"), running(storage, deploy=tmp_path / "none.yaml"):
+        pass
+    assert ["serve_app.runtime.launch" in command for command in commands] == [True]
+    assert "secret" not in commands[0]
     with pytest.raises(ConfigError, match="LEAGUE_DATABASE_URL contains a password"):
         launch._serve_on_cluster("127.0.0.1:9", storage, {}, None)
+
+
+INCONSISTENT: tuple[tuple[dict[str, Any], str], ...] = (
+    ({"heartbeat": 6}, "heartbeat must be at most 5"),
+    ({"poll": 10}, "poll_slowest must be at least poll"),
+    ({"max_body": 1}, "max_body"),
+    ({"max_bodies": 1}, "max_bodies"),
+    ({"root_path": "ai"}, "expected a path like /ai"),
+    ({"root_path": "/ai/"}, "expected a path like /ai"),
+    ({"root_path": "/ai?x"}, "expected a path like /ai"),
+    ({"root_path": "/leagues"}, "begins like a path of this server"),
+    ({"root_path": "/v1/ai"}, "begins like a path of this server"),
+    ({"cors_origins": ["*"]}, "expected an origin like"),
+    ({"cors_origins": ["https://game.example/"]}, "expected an origin like"),
+    ({"cors_origins": ["https://game.example"], "require_keys": "never"}, "cors_origins needs API keys"),
+)
+
+
+def test_inconsistent_settings_are_rejected() -> None:
+    for setting, message in INCONSISTENT:
+        with pytest.raises(ValidationError, match=message):
+            ServeSettings.model_validate(setting)
+    assert 3 * ServeSettings().heartbeat <= LIVENESS_TIMEOUT.total_seconds(), "two heartbeats may be lost"
+
+
+def test_deploy_yaml_updates_without_lost_requests() -> None:
+    from ray.serve.config import AutoscalingConfig
+    from ray.serve.schema import ServeDeploySchema
+
+    schema = ServeDeploySchema.model_validate(yaml.safe_load(DEPLOY_YAML.read_text()))
+    (application,) = schema.applications
+    (deployment,) = application.deployments
+    assert application.import_path == "serve_app.app:build_app"
+    ServeSettings.model_validate(application.args)
+    assert schema.http_options.host == "127.0.0.1"
+    replicas = AutoscalingConfig.model_validate(deployment.autoscaling_config)
+    assert replicas.min_replicas >= 2, "one replica may fail"
+    assert replicas.min_replicas == replicas.max_replicas, "evaluations share the cores"
+    assert deployment.max_surge_percent == 100, "new replicas start before old ones stop"
+    assert deployment.graceful_shutdown_timeout_s >= 40, "draining takes 30 s"
+    assert deployment.backpressure_config.status_code == 429
+    both = 2 * replicas.max_replicas * deployment.ray_actor_options.num_cpus
+    assert both <= 2, "old and new replicas must fit on two cores"
+
+
+def test_all_but_loopback_addresses_are_exposed() -> None:
+    for host in ("127.0.0.1", "127.9.9.9", "localhost", "::1", "[::1]"):
+        assert not is_exposed(host)
+    for host in ("0.0.0.0", "::", "10.0.0.1", "192.168.1.2", "example.org", "", "localhost.evil"):
+        assert is_exposed(host)
+
+
+DESCRIBE = "from serve_app.runtime.replica_process import this_process; print(this_process().description['process'])"
+
+
+def test_which_processes_have_ended() -> None:
+    """Nothing is known of a replica that does not describe its process: another release may use other keys."""
+    described = subprocess.run([sys.executable, "-c", DESCRIBE], stdout=subprocess.PIPE, text=True, check=True).stdout
+    assert has_ended({"process": described.strip()})
+    for description in (this_process().description, {"machine": "another/1", "pid": "1", "start": "1"}, {}):
+        assert not has_ended(description)
+
+
+WITHOUT_PANDAS = """
+import sys
+from serve_app.runtime.worker_start import import_serve
+
+import_serve()
+print({"pandas", "pyarrow", "sqlalchemy"} & sys.modules.keys())
+import pandas
+from ray.serve._private import utils
+print(utils.pd)
+"""
+
+
+def test_ray_serve_is_imported_without_pandas_which_others_can_import() -> None:
+    done = subprocess.run([sys.executable, "-c", WITHOUT_PANDAS], capture_output=True, text=True, timeout=120)
+    assert done.stdout.split("\n") == ["set()", "None", ""], done.stderr
+
+
+IMPORTS = """
+import sys
+import serve_app.app, serve_app.runtime.serve_bypass
+heavy = {name.partition(".")[0] for name in sys.modules} & {"torch", "pettingzoo", "supersuit", "mpe2", "tensorflow"}
+heavy |= {name for name in sys.modules if name.startswith(("ray.rllib", "league.environments"))}
+print(*sorted(heavy))
+"""
+
+
+def test_a_replica_imports_neither_torch_nor_environments() -> None:
+    process = subprocess.run([sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=True)
+    assert process.stdout.split() == []
+
+
+@pytest.fixture
+def client(monkeypatch: pytest.MonkeyPatch) -> TestClient:
+    monkeypatch.setattr(serve_bypass, "_application", None)
+    monkeypatch.setattr(serve_bypass, "_root_path", "")
+    (outer,) = serve_bypass.middlewares()
+    return TestClient(outer.cls(PlainTextResponse("serve"), *outer.args, **outer.kwargs))
+
+
+def test_which_requests_bypass_ray_serve(client: TestClient) -> None:
+    assert client.post("/v1/policies/board/action").text == "serve", "this process has no application"
+    serve_bypass.install(PlainTextResponse("bypass"))
+    for path in ("/v1/policies/board/action", "/v2/models/board/infer", "/v1/leagues", "/", "/-/other"):
+        assert client.post(path).text == "bypass", path
+    for path in ("/-/healthz", "/-/routes"):
+        assert client.post(path).text == "serve", path
+
+
+async def echo(scope: Scope, receive: Receive, send: Send) -> None:
+    await PlainTextResponse(f"{scope['path']} {scope['raw_path'].decode()}")(scope, receive, send)
+
+
+def test_the_root_path_is_removed(client: TestClient) -> None:
+    serve_bypass.install(echo, "/ai")
+    for path, text in (
+        ("/ai/v1/policies/board/action", "/v1/policies/board/action /v1/policies/board/action"),
+        ("/v1/policies/board/action", "/v1/policies/board/action /v1/policies/board/action"),
+        ("/ai/v2/models/a%2Fb/infer", "/v2/models/a/b/infer /v2/models/a%2Fb/infer"),
+        ("/ai/leagues/a%2Fb", "/leagues/a/b /leagues/a%2Fb"),
+        ("/ai/", "/ /"),
+        ("/ai", "/ /"),
+        ("/ai/-/healthz", "serve"),
+        ("/aims/v1/policies/board/action", "/aims/v1/policies/board/action /aims/v1/policies/board/action"),
+        ("/v1/policies/ai/ai", "/v1/policies/ai/ai /v1/policies/ai/ai"),
+    ):
+        assert client.post(path).text == text, path
+
+
+def test_the_rest_of_the_server_sees_paths_without_the_root_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serve_bypass, "_application", None)
+    monkeypatch.setattr(serve_bypass, "_root_path", "/ai")
+    client = TestClient(serve_bypass.ServeBypass(echo))
+    shown = [client.get(path).text for path in ("/ai", "/ai/", "/ai/leagues/a%2Fb", "/aims")]
+    assert shown == ["/ /", "/ /", "/leagues/a/b /leagues/a%2Fb", "/aims /aims"]
+
+
+LONG = 60.0
+
+
+@pytest.mark.anyio
+async def test_work_that_does_not_wait_completes_without_time() -> None:
+    async def work() -> int:
+        return 5
+
+    assert await run_within(0, work()) == 5
+
+
+@pytest.mark.anyio
+async def test_waiting_work_gets_results_and_errors() -> None:
+    async def work(future: asyncio.Future[int]) -> int:
+        await asyncio.sleep(0)
+        try:
+            found = await future
+        except ZeroDivisionError:
+            found = -1
+        return found + await asyncio.to_thread(lambda: 1)
+
+    loop = asyncio.get_running_loop()
+    good, bad = loop.create_future(), loop.create_future()
+    loop.call_later(0.01, good.set_result, 41)
+    loop.call_later(0.01, bad.set_exception, ZeroDivisionError())
+    assert await run_within(LONG, work(good)) == 42
+    assert await run_within(LONG, work(bad)) == 0
+
+
+@pytest.mark.anyio
+async def test_errors_are_passed_on() -> None:
+    async def work(waits: bool) -> None:
+        if waits:
+            await asyncio.sleep(0)
+        raise TimeoutError("its own")
+
+    for waits in (False, True):
+        with pytest.raises(TimeoutError, match="its own"):
+            await run_within(LONG, work(waits))
+
+
+@pytest.mark.anyio
+async def test_work_that_waits_too_long_is_cancelled_and_can_clean_up() -> None:
+    cleaned_up = []
+
+    async def work() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(0)
+            cleaned_up.append(True)
+
+    with pytest.raises(TimeLimitExceeded):
+        await run_within(0.01, work())
+    assert cleaned_up
+
+
+@pytest.mark.anyio
+async def test_a_cancelled_caller_cancels_the_work() -> None:
+    is_cancelled = False
+
+    async def work() -> None:
+        nonlocal is_cancelled
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            is_cancelled = True
+            raise
+
+    task = asyncio.create_task(run_within(LONG, work()))
+    for _ in range(2):
+        await asyncio.sleep(0)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert is_cancelled
+
+
+TARGET = 0.6
+targets = st.floats(0.2, 0.9)
+loads = st.lists(st.none() | st.floats(0, 4), max_size=20)
+bounds = st.tuples(st.integers(1, 10), st.integers(0, 10)).map(lambda each: (each[0], sum(each)))
+
+
+@given(loads, targets, st.integers(0, 30), bounds)
+def test_the_bounds_are_respected(
+    loads: list[float | None], target: float, current: int, bounds: tuple[int, int]
+) -> None:
+    assert bounds[0] <= required_replicas(loads, target, current, *bounds) <= bounds[1]
+
+
+@given(st.floats(0, 3), loads, targets, st.integers(1, 30), st.floats(0, 3))
+def test_more_load_needs_no_fewer_replicas(
+    load: float, others: list[float | None], target: float, current: int, more: float
+) -> None:
+    light, heavy = ([each, *others] for each in (load, load + more))
+    assert required_replicas(heavy, target, current, 1, 99) >= required_replicas(light, target, current, 1, 99)
+
+
+@given(loads.filter(lambda each: None in each), targets, st.integers(1, 30))
+def test_no_replica_is_removed_while_a_load_is_unknown(loads: list[float | None], target: float, current: int) -> None:
+    assert required_replicas(loads, target, current, 1, 99) >= current
+
+
+@given(
+    st.floats(0, 8),
+    st.floats(0.3, 0.9),
+    st.floats(0, 0.05),
+    st.integers(1, 20),
+    st.integers(0, 2**32 - 1),
+)
+def test_a_constant_load_gets_a_constant_number(
+    demand: float, target: float, overhead: float, current: int, seed: int
+) -> None:
+    """Replicas share the demand, in cores; each has an overhead, cannot use more than a core, and measures up to a
+    tenth wrongly. The number may grow and then shrink, but never grows again.
+    """
+    numbers = [current]
+    for row in np.random.default_rng(seed).uniform(0.9, 1.1, size=(30, 20)).tolist():
+        share = min(1.0, demand / numbers[-1] + overhead)
+        numbers.append(required_replicas([share * each for each in row[: numbers[-1]]], target, numbers[-1], 1, 20))
+    grows = [after > before for before, after in pairwise(numbers) if after != before]
+    assert grows == sorted(grows, reverse=True)
+    assert numbers[-1] == numbers[-2]
+
+
+def test_examples() -> None:
+    for loads, current, expected in (
+        ([0.5], 1, 1),
+        ([0.7], 1, 2),
+        ([1.0], 1, 2),
+        ([1.0, 1.0], 2, 4),
+        ([1.0, 0.0], 2, 2),
+        ([0.27, 0.27], 2, 2),
+        ([0.2, 0.2], 2, 1),
+        ([0.2], 2, 1),
+        ([], 2, 1),
+        ([None, 1.9], 2, 4),
+        ([0.0, None], 2, 2),
+    ):
+        assert required_replicas(loads, TARGET, current, 1, 10) == expected, loads
+    assert MARGIN == 0.2
+    for target in (0, 1, -0.1, 1.5):
+        with pytest.raises(ValueError, match="target must be greater than 0 and less than 1"):
+            LoadPolicy(target)
+
+
+class Controller:
+    """Calls a policy as Ray's controller does, with a clock of its own."""
+
+    def __init__(self, replicas: int) -> None:
+        application = DeploymentID("PolicyServer", "policy-league")
+        self.replicas = [ReplicaID(f"replica-{i}", application) for i in range(replicas)]
+        self.reports: dict[ReplicaID, list[TimeStampedValue]] = {}
+        self.now = 1000.0
+        self.state: dict[str, Any] = {}
+
+    def decide(self, policy: LoadPolicy) -> int:
+        context: Any = SimpleNamespace(
+            running_replicas=self.replicas,
+            raw_metrics={LOAD: self.reports},
+            target_num_replicas=len(self.replicas),
+            capacity_adjusted_min_replicas=1,
+            capacity_adjusted_max_replicas=4,
+            policy_state=dict(self.state),
+            current_time=self.now,
+        )
+        wanted, self.state = policy(context)
+        return wanted
+
+
+def test_the_load_is_the_mean_of_the_samples() -> None:
+    controller = Controller(1)
+    controller.reports = {controller.replicas[0]: [TimeStampedValue(at, load) for at, load in ((1, 0.2), (2, 0.9))]}
+    assert controller.decide(LoadPolicy(TARGET)) == 1
+    controller.reports[controller.replicas[0]] += [TimeStampedValue(3, 0.9)]
+    assert controller.decide(LoadPolicy(TARGET)) == 2
+
+
+def test_statistics_that_no_longer_change_are_unknown() -> None:
+    """Clocks of nodes differ: the age of a report is the time since it arrived."""
+    controller, policy = Controller(2), LoadPolicy(TARGET)
+    alive, stuck = controller.replicas
+    controller.reports = {each: [TimeStampedValue(5e9, 0.01)] for each in controller.replicas}
+    assert controller.decide(policy) == 1
+    controller.now += STALE + 1
+    controller.reports[alive] = [TimeStampedValue(5e9 + 1, 0.01)]
+    assert controller.decide(policy) == 2
+    controller.reports[stuck] = [TimeStampedValue(5e9 + 1, 0.01)]
+    assert controller.decide(policy) == 1
+
+
+def test_ray_accepts_the_policy_of_deploy_yaml() -> None:
+    """Ray sends it to its controller by value."""
+    (deployment,) = yaml.safe_load(DEPLOY_YAML.read_text())["applications"][0]["deployments"]
+    config = AutoscalingConfig.model_validate(deployment["autoscaling_config"])
+    assert config.look_back_period_s > config.metrics_interval_s
+    assert isinstance(config.policy, AutoscalingPolicy)
+    serialized = config.policy.get_serialized_policy_def()
+    assert serialized is not None
+    policy = pickle.loads(serialized)(**config.policy.policy_kwargs)
+    assert Controller(3).decide(policy) == 3
+    assert b"serve_app.observability" not in serialized

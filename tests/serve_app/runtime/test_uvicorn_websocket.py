@@ -22,6 +22,8 @@ from serve_app.access import access_control
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.inference.stream_codec import RESPONSE, encode_request
+from serve_app.routes import stream
+from serve_app.routes.stream import ClosingTimes
 from serve_app.runtime import uvicorn_websocket
 from tests.support.clients.actions import BOARD, boards
 from tests.support.leagues.served_leagues import promote
@@ -71,6 +73,10 @@ def test_messages_are_answered_in_order(listener: Listening) -> None:
         for request in requests:  # without waiting: more than one turn answers
             stream.send(json.dumps(request))
         assert [receive(stream) for _ in requests] == one_by_one * 20
+    with connect(listener.stream("board"), proxy=None) as stream:  # offers compression
+        assert stream.response is not None
+        assert "sec-websocket-extensions" not in stream.response.headers
+        assert stream.response.headers["x-league-replica"] == "replica-1"
 
 
 def test_messages_of_one_connection_share_one_state(listener: Listening) -> None:
@@ -87,45 +93,32 @@ def test_messages_of_one_connection_share_one_state(listener: Listening) -> None
         assert actions == [0, 0] + [1] * 38
 
 
-def test_messages_are_not_compressed(listener: Listening) -> None:
-    with connect(listener.stream("board"), proxy=None) as stream:  # offers compression
-        assert stream.response is not None
-        assert "sec-websocket-extensions" not in stream.response.headers
-        assert stream.response.headers["x-league-replica"] == "replica-1"
-        assert answer_to(stream, BODY)["version"] == 1
+KEY = "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
+UPGRADE = f"Connection: Upgrade\r\nUpgrade: websocket\r\n{KEY}"
 
 
-@pytest.mark.parametrize(("query", "status", "code"), [("?version=9", 404, "unknown_version"), ("?follow=0", 400, "")])
-def test_a_rejected_stream_has_an_error_response(listener: Listening, query: str, status: int, code: str) -> None:
-    with pytest.raises(InvalidStatus) as caught, open_stream(listener, query=query):
-        pass
-    response = caught.value.response
-    assert response.status_code == status
-    assert json.loads(response.body or b"")["code"] in (code, "invalid_reference")
-
-
-@pytest.mark.parametrize(
-    "extra",
-    ["Content-Length: 2\r\n\r\n{}", "Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n", f"X: {'x' * 10_000}\r\n\r\n"],
-    ids=["body", "chunked", "large header"],
-)
-def test_a_handshake_that_is_no_websocket_is_answered(listener: Listening, extra: str) -> None:
-    host, port = listener.url.removeprefix("http://").split(":")
-    with socket.create_connection((host, int(port)), timeout=DEADLINE) as client:
-        client.sendall(
-            f"GET /v1/policies/board/stream HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
-            f"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n{extra}".encode()
-        )
-        assert client.makefile("rb").read().startswith(b"HTTP/1.1 400 ")
-
-
-def test_a_page_of_another_origin_opens_no_stream(listener: Listening) -> None:
-    with pytest.raises(InvalidStatus) as refused, open_stream(listener, origin="https://evil.example"):
-        pass
-    assert refused.value.response.status_code == 403
-    assert json.loads(refused.value.response.body or b"")["code"] == "cross_site"
+def test_a_rejected_stream_has_an_error_response(listener: Listening) -> None:
+    for query, origin, status, code in (
+        ("?version=9", None, 404, "unknown_version"),
+        ("?follow=0", None, 400, "invalid_reference"),
+        ("", "https://evil.example", 403, "cross_site"),
+    ):
+        with pytest.raises(InvalidStatus) as caught, open_stream(listener, query=query, origin=origin):
+            pass
+        response = caught.value.response
+        assert (response.status_code, json.loads(response.body or b"")["code"]) == (status, code)
     with open_stream(listener, origin=listener.url) as stream:
         assert answer_to(stream, BODY)["version"] == 1
+    host, port = listener.url.removeprefix("http://").split(":")
+    for no_handshake in (
+        "Content-Length: 2\r\n\r\n{}",
+        "Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
+        f"X: {'x' * 10_000}\r\n\r\n",
+    ):
+        with socket.create_connection((host, int(port)), timeout=DEADLINE) as client:
+            head = f"GET /v1/policies/board/stream HTTP/1.1\r\nHost: {host}\r\n{UPGRADE}\r\n"
+            client.sendall((head + no_handshake).encode())
+            assert client.makefile("rb").read().startswith(b"HTTP/1.1 400 ")
 
 
 def test_a_fragmented_message_is_one_message(listener: Listening) -> None:
@@ -168,8 +161,7 @@ class RawClient:
         self.socket.settimeout(DEADLINE)
         self.socket.connect((host, int(port)))
         self.socket.sendall(
-            f"GET /v1/policies/{model}/stream HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
-            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+            f"GET /v1/policies/{model}/stream HTTP/1.1\r\nHost: {host}\r\n{UPGRADE}\r\n"
             f"X-Api-Key: {token}\r\n\r\n".encode()
         )
         self.file = self.socket.makefile("rb")
@@ -244,19 +236,25 @@ def nothing_follows(raw: RawClient, listener: Listening, token: str) -> bool:
         raw.socket.settimeout(DEADLINE)
 
 
-@pytest.mark.parametrize(
-    "sent",
-    [PING * 1000, frame(b"", 0x8A) * 1000 + PING, frame(b"{", 0x01) + PING, b"\x81\x02{}"],
-    ids=["pings", "pongs", "fragments", "unmasked"],
-)
-def test_frames_that_are_no_messages_wait_for_the_rate_of_the_key(registry: Registry, sent: bytes) -> None:
-    _, slow = registry.keys.create("slow", ["act"], rate=0.001)
+def test_frames_wait_for_the_rate_of_the_key(registry: Registry, subtests: pytest.Subtests) -> None:
+    """A client whose messages are refused, or that sends other frames, is not read for a while."""
     _, other = registry.keys.create("other", ["act"])
+    flood = {
+        "pings": PING * 1000,
+        "pongs": frame(b"", 0x8A) * 1000 + PING,
+        "fragments": frame(b"{", 0x01) + PING,
+        "unmasked": b"\x81\x02{}",
+        "refused": frame(b"{}") * 500,
+    }
+    tokens = {name: registry.keys.create(name, ["act"], rate=0.001)[1] for name in flood}
     with listening(registry.storage) as listener:
-        raw = RawClient(listener, token=slow)  # the handshake is the request that the rate permits
-        raw.socket.sendall(sent)
-        assert nothing_follows(raw, listener, other)
-        raw.socket.close()
+        for name, sent in flood.items():
+            with subtests.test(name):
+                raw = RawClient(listener, token=tokens[name])  # the handshake is the request that the rate permits
+                raw.socket.sendall(sent)
+                assert name != "refused" or b"rate_limited" in raw.frame()[1]
+                assert nothing_follows(raw, listener, other)
+                raw.socket.close()
 
 
 def test_answers_to_pings_of_the_server_are_free(registry: Registry) -> None:
@@ -268,20 +266,7 @@ def test_answers_to_pings_of_the_server_are_free(registry: Registry) -> None:
             assert first == 0x89
             raw.socket.sendall(frame(payload, 0x8A))
         raw.socket.sendall(frame(b"\x03\xe8", 0x88))
-        while (received := raw.frame())[0] == 0x89:
-            pass
-        assert received == (0x88, b"\x03\xe8"), "a client may always close"
-
-
-def test_a_client_whose_messages_are_refused_is_not_read_for_a_while(registry: Registry) -> None:
-    _, slow = registry.keys.create("slow", ["act"], rate=0.001)
-    _, other = registry.keys.create("other", ["act"])
-    with listening(registry.storage) as listener:
-        raw = RawClient(listener, token=slow)
-        raw.socket.sendall(frame(b"{}") * 500)
-        assert b"rate_limited" in raw.frame()[1]
-        assert nothing_follows(raw, listener, other)
-        raw.socket.close()
+        assert raw.answer() == (0x88, b"\x03\xe8"), "a client may always close"
 
 
 def test_frames_of_all_connections_share_the_turn(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,22 +311,15 @@ def test_frames_without_a_key_share_a_rate(storage: Storage, monkeypatch: pytest
         raw.socket.close()
 
 
-def test_a_message_of_too_many_fragments_closes_the_stream(listener: Listening) -> None:
-    raw = RawClient(listener)
-    raw.socket.sendall(frame(BODY.encode(), 0x01) + frame(b"", 0x00) * 1025)
-    assert raw.end() == 1009
-
-
 def test_incomplete_messages_have_limited_memory(storage: Storage) -> None:
     """The stream that exceeds the limit is closed, unless it holds little; others are not affected."""
     settings = QUICK.model_copy(update={"max_body": 2**20, "max_batch": 1024, "max_incomplete": 300_000})
     half = frame(b" " * 200_000, 0x01)
     with listening(storage, settings) as listener:
         first, small, second = (RawClient(listener) for _ in range(3))
-        ping = frame(b"", 0x89)
         for raw, part in ((first, half), (small, frame(BODY.encode(), 0x01))):
-            raw.socket.sendall(part + ping)
-            assert raw.frame() == (0x8A, b"")
+            raw.socket.sendall(part + PING)
+            assert raw.frame() == PONG
         second.socket.sendall(half)
         assert second.end() == 1013
         first.socket.sendall(frame(b"", 0x80))
@@ -374,37 +352,38 @@ def test_frames_can_arrive_byte_by_byte_or_all_at_once(listener: Listening) -> N
     assert raw.file.read() == b"", "the connection is closed"
 
 
-@pytest.mark.parametrize(
-    ("sent", "code"),
-    [
-        (b"\x81\x02{}", 1002),  # not masked
-        (frame(b"{}", 0x83), 1002),  # invalid opcode
-        (frame(b"{}", 0xC1), 1002),  # extension bit
-        (frame(b"{}", 0x80), 1002),  # continuation without a start
-        (frame(b"{", 0x01) + frame(b"{}"), 1002),  # second message within a first
-        (frame(b"x" * 126, 0x89), 1002),  # ping that is too long
-        (frame(b"\xff{}"), 1007),
-        (frame(b"{", 0x01) + frame(b"\xff}", 0x80), 1007),
-        (b"\x81\xff" + struct.pack(">Q", 2**40) + b"\1\2\3\4", 1009),
-        (b"\x82\xff" + struct.pack(">Q", 2**63) + b"\1\2\3\4", 1009),
-        (frame(b" " * (64 * 1024 + 1)), 1009),
-        (frame(b" " * 2**15, 0x01) + frame(b" " * 2**15, 0x00) + frame(b" ", 0x80), 1009),
-    ],
+INVALID_FRAMES = (
+    (b"\x81\x02{}", 1002),  # not masked
+    (frame(b"{}", 0x83), 1002),  # invalid opcode
+    (frame(b"{}", 0xC1), 1002),  # extension bit
+    (frame(b"{}", 0x80), 1002),  # continuation without a start
+    (frame(b"{", 0x01) + frame(b"{}"), 1002),  # second message within a first
+    (frame(b"x" * 126, 0x89), 1002),  # ping that is too long
+    (frame(b"\xff{}"), 1007),
+    (frame(b"{", 0x01) + frame(b"\xff}", 0x80), 1007),
+    (b"\x81\xff" + struct.pack(">Q", 2**40) + b"\1\2\3\4", 1009),
+    (b"\x82\xff" + struct.pack(">Q", 2**63) + b"\1\2\3\4", 1009),
+    (frame(b" " * (64 * 1024 + 1)), 1009),
+    (frame(b" " * 2**15, 0x01) + frame(b" " * 2**15, 0x00) + frame(b" ", 0x80), 1009),
+    (frame(b"{", 0x01) + frame(b"", 0x00) * 1025, 1009),  # too many fragments
 )
-def test_an_invalid_frame_ends_the_stream(listener: Listening, sent: bytes, code: int) -> None:
-    raw = RawClient(listener)
-    raw.socket.sendall(frame(BODY.encode()) + sent)
-    assert b'"version":1' in raw.frame()[1], "earlier messages are answered"
-    assert raw.end() == code
 
 
-@pytest.mark.parametrize("size", [125, 126, 2**16 - 1, 2**16])
-def test_all_encodings_of_the_length(listener: Listening, size: int) -> None:
-    with open_stream(listener) as stream:
-        assert answer_to(stream, BODY + " " * (size - len(BODY)) if size > len(BODY) else "{}".ljust(size))
-    with open_stream(listener, "vector") as stream:
+def test_an_invalid_frame_ends_the_stream(listener: Listening, subtests: pytest.Subtests) -> None:
+    for sent, code in INVALID_FRAMES:
+        with subtests.test(sent=sent[:20], code=code):
+            raw = RawClient(listener)
+            raw.socket.sendall(frame(BODY.encode()) + sent)
+            assert b'"version":1' in raw.frame()[1], "earlier messages are answered"
+            assert raw.end() == code
+
+
+def test_all_encodings_of_the_length(listener: Listening) -> None:
+    with open_stream(listener) as stream, open_stream(listener, "vector") as vector:
+        for size in (125, 126, 2**16 - 1, 2**16):
+            assert answer_to(stream, (BODY if size > len(BODY) else "{}").ljust(size))
         many = json.dumps({"observations": [[0.5, 1]] * 8, "probabilities": True})
-        assert len(json.dumps(answer_to(stream, many))) > 126
+        assert len(json.dumps(answer_to(vector, many))) > 126
 
 
 def test_the_server_stops_reading_from_a_client_that_does_not_read(listener: Listening) -> None:
@@ -430,42 +409,28 @@ def test_a_slow_graph_is_awaited(storage: Storage) -> None:
         assert stream.ping().wait(DEADLINE)
 
 
-def test_a_revoked_key_ends_the_stream(registry: Registry) -> None:
-    _, token = registry.keys.create("bot", ["act"])
-    with (
-        listening(registry.storage) as listener,
-        open_stream(listener, additional_headers={"x-api-key": token}) as stream,
-    ):
-        assert answer_to(stream, BODY)["version"] == 1
-        registry.keys.revoke("bot")
-        with pytest.raises(ConnectionClosed) as caught:
-            until(lambda: answer_to(stream, BODY) and False)
-        assert caught.value.rcvd is not None
-        assert (caught.value.rcvd.code, "bot was revoked" in caught.value.rcvd.reason) == (1008, True)
-        until(lambda: listener.server.stream.connections.open == 0)
-
-
-@pytest.mark.parametrize("name", ["bot", "b" * 100])
-def test_a_revoked_key_ends_an_idle_stream(registry: Registry, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_a_revoked_key_ends_an_idle_stream(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reason of a close frame is limited to 123 bytes, and the name of a key to 100."""
     monkeypatch.setattr("serve_app.routes.stream.KEY_CHECK_INTERVAL", 0.1)
-    _, token = registry.keys.create(name, ["act"])
-    with (
-        listening(registry.storage) as listener,
-        open_stream(listener, additional_headers={"x-api-key": token}) as stream,
-    ):
-        registry.keys.revoke(name)
-        with pytest.raises(ConnectionClosed) as caught:
-            stream.recv(DEADLINE)
-        assert caught.value.rcvd is not None
-        assert (caught.value.rcvd.code, f"{name} was" in caught.value.rcvd.reason) == (1008, True)
-        until(lambda: listener.server.stream.connections.open == 0)
+    tokens = {name: registry.keys.create(name, ["act"])[1] for name in ("bot", "b" * 100)}
+    with listening(registry.storage) as listener:
+        for name, token in tokens.items():
+            with open_stream(listener, additional_headers={"x-api-key": token}) as stream:
+                registry.keys.revoke(name)
+                code, reason = close_of(stream)
+                assert (code, f"{name} was" in reason) == (1008, True)
+            until(lambda: listener.server.stream.connections.open == 0)
 
 
 def test_a_draining_server_sends_a_last_message(registry: Registry) -> None:
     with listening(registry.storage) as listener, listening(registry.storage) as other:
-        with open_stream(listener) as plain, open_stream(listener, "memory") as recurrent:
+        with (
+            open_stream(listener) as plain,
+            open_stream(listener, "memory") as recurrent,
+            open_stream(listener, "memory") as batch,
+        ):
             answer_to(plain, BODY)
+            answer_to(batch, json.dumps({"observations": [[1], [2]]}))
             assert [answer_to(recurrent, ONE)["action"] for _ in range(2)] == [0, 0]
             promote(registry, "board", 2)
             listener.drain()
@@ -473,17 +438,10 @@ def test_a_draining_server_sends_a_last_message(registry: Registry) -> None:
             assert last_message.keys() == {"closing", "state", "model", "version", "sha256"}
             assert (last_message["closing"], last_message["model"], last_message["version"]) == (True, "memory", 1)
             assert close_of(recurrent) == (1012, "the replica is shutting down: reconnect")
-            assert close_of(plain)[0] == 1012
+            assert [type(token) for token in receive(batch)["state"]] == [str, str]
+            assert close_of(plain)[0] == close_of(batch)[0] == 1012
         with open_stream(other, "memory", f"?version={last_message['version']}") as again:
             assert answer_to(again, json.dumps({"observation": [1], "state": last_message["state"]}))["action"] == 1
-
-
-def test_the_last_message_to_a_batch_has_the_state_of_each_row(storage: Storage) -> None:
-    with listening(storage) as listener, open_stream(listener, "memory") as stream:
-        answer_to(stream, json.dumps({"observations": [[1], [2]]}))
-        listener.drain()
-        assert [type(token) for token in receive(stream)["state"]] == [str, str]
-        assert close_of(stream)[0] == 1012
 
 
 def test_a_client_that_neither_reads_nor_closes_does_not_block_stopping(storage: Storage) -> None:
@@ -516,3 +474,64 @@ def test_broken_connections_are_removed(listener: Listening, monkeypatch: pytest
         raw.file.close()
         raw.socket.close()
     until(lambda: connections.open == 0)
+
+
+def closing(connection: ClientConnection) -> tuple[int, dict[str, Any]]:
+    """The close code of a stream, and the message before it."""
+    last: dict[str, Any] = {}
+    try:
+        while True:
+            last = receive(connection)
+    except ConnectionClosed as end:
+        return end.rcvd.code if end.rcvd else 1006, last
+
+
+@pytest.mark.parametrize("change", ["added", "removed", "drained"])
+def test_open_streams_reconnect_when_the_number_of_replicas_has_changed(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    monkeypatch.setattr(stream, "AFTER_CHANGE", ClosingTimes(0.0, 0.1))
+    if change != "added":
+        registry.replicas.register("replica-2", {})
+    with (
+        listening(registry.storage) as listener,
+        open_stream(listener, "memory") as one,
+        open_stream(listener, "memory") as other,
+    ):
+        for connection in (one, one, other, other):
+            assert answer_to(connection, ONE)["action"] == 0  # the third one would be 1
+        if change == "removed":
+            registry.replicas.remove("replica-2")
+        else:
+            registry.replicas.register("replica-2", {}, is_draining=change == "drained")
+        for connection in (one, other):
+            code, last = closing(connection)
+            assert (code, last["closing"]) == (1012, True)
+        with open_stream(listener, "memory") as again:
+            assert answer_to(again, json.dumps({"observation": [1], "state": last["state"]}))["action"] == 1
+
+
+def test_streams_stay_open_when_a_drained_replica_ends(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They reconnected when it began to drain."""
+    monkeypatch.setattr(stream, "AFTER_CHANGE", ClosingTimes(0.0, 0.1))
+    registry.replicas.register("replica-2", {}, is_draining=True)
+    with listening(registry.storage) as listener, open_stream(listener, "memory") as connection:
+        assert [answer_to(connection, ONE)["action"] for _ in range(2)] == [0, 0]
+        registry.replicas.remove("replica-2")
+        for _ in range(2):
+            last = registry.replicas.registered()[0].seen_at
+            until(lambda last=last: registry.replicas.registered()[0].seen_at > last)
+        assert listener.server.stream._closings == {}
+        assert answer_to(connection, ONE)["action"] == 1
+
+
+def test_streams_of_a_replica_that_stops_are_closed_earlier(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "AFTER_CHANGE", ClosingTimes(300.0, 400.0))
+    monkeypatch.setattr(stream, "WHILE_DRAINING", ClosingTimes(0.0, 0.1))
+    with listening(registry.storage) as listener, open_stream(listener, "memory") as connection:
+        registry.replicas.register("replica-2", {})
+        answer_to(connection, ONE)
+        monkeypatch.setattr(listener.server.stream, "_is_draining", lambda: True)
+        assert closing(connection)[0] == 1012

@@ -2,13 +2,14 @@
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from league.interface import AgentInterface
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import Box, DictSpace, Discrete
 from tests.support.leagues.served_leagues import everything, promote, publish, register
+from tests.support.policies.graphs import serialized
 
 DTYPES = (
     ["bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64"]
@@ -125,11 +126,7 @@ def _graph(
         _value("action", dtype, shape),
         _value("action_dist_inputs", "float32", (width or 2 * shape[0],)),
     ]
-    initializers = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "policy", inputs, outputs, initializers)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    onnx.checker.check_model(model)
-    return model.SerializeToString()
+    return serialized(nodes, inputs, outputs, constants)
 
 
 def _value(name: str, dtype: str, shape: tuple[int, ...]) -> onnx.ValueInfoProto:

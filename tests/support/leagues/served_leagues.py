@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from league.conditions import ActionSelection
 from league.config.league import LeagueConfig
@@ -18,7 +18,7 @@ from league.registry.storage.manifest import PROBES, Manifest, Parity, PolicyMan
 from league.registry.storage.rows import VersionRow
 from league.settings import Storage
 from league.spaces import Box, DictSpace, Discrete
-from tests.support.policies.graphs import continuous, counting, masked_mlp
+from tests.support.policies.graphs import continuous, counting, masked_mlp, serialized
 from tests.support.templates import copy_of
 
 BOARD = AgentInterface(
@@ -65,11 +65,7 @@ def nested() -> bytes:
         helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
         helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
     ]
-    constants = [numpy_helper.from_array(np.array([1], np.int64), "axis")]
-    graph = helper.make_graph(nodes, "policy", inputs, outputs, constants)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    onnx.checker.check_model(model)
-    return model.SerializeToString()
+    return serialized(nodes, inputs, outputs, {"axis": np.array([1])})
 
 
 def interface(policies: dict[str, AgentInterface]) -> Interface:

@@ -1,6 +1,6 @@
 """ONNX graphs written by hand, with the interface of exported graphs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import onnx
@@ -57,7 +57,7 @@ def masked_mlp(
         constants["wv"] = (random.normal(size=width) / np.sqrt(width)).astype(np.float32)
         nodes += [helper.make_node("MatMul", [name, "wv"], ["zv"]), helper.make_node("Tanh", ["zv"], ["value"])]
         outputs.append(helper.make_tensor_value_info("value", TensorProto.FLOAT, ["batch"]))
-    return _serialized(nodes, inputs, outputs, constants)
+    return serialized(nodes, inputs, outputs, constants)
 
 
 ENDLESS = 84
@@ -114,7 +114,7 @@ def counting() -> bytes:
         helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
         helper.make_tensor_value_info("state_out_0", TensorProto.FLOAT, ["batch", 1]),
     ]
-    return _serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
+    return serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
 
 
 def memoryless() -> bytes:
@@ -130,7 +130,7 @@ def memoryless() -> bytes:
         helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
         helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
     ]
-    return _serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
+    return serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
 
 
 def continuous() -> bytes:
@@ -144,15 +144,16 @@ def continuous() -> bytes:
         helper.make_tensor_value_info("action", TensorProto.FLOAT, ["batch", 2]),
         helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 4]),
     ]
-    return _serialized(nodes, inputs, outputs, {})
+    return serialized(nodes, inputs, outputs, {})
 
 
-def _serialized(
+def serialized(
     nodes: list[onnx.NodeProto],
     inputs: list[onnx.ValueInfoProto],
     outputs: list[onnx.ValueInfoProto],
-    constants: dict[str, np.ndarray],
+    constants: Mapping[str, np.ndarray | np.generic],
 ) -> bytes:
+    """A graph in the format of exported ones."""
     initializers = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
     graph = helper.make_graph(nodes, "policy", inputs, outputs, initializers)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)

@@ -23,7 +23,7 @@ from serve_app.inference.plain_format import PlainRequest
 from serve_app.routes.plain_action import PlainActions
 from serve_app.runtime.uvicorn_http import HttpProtocol
 from serve_app.settings import ServeSettings
-from tests.support.clients.actions import boards
+from tests.support.clients.actions import board_arrays, boards
 from tests.support.leagues.served_leagues import everything
 from tests.support.servers.replicas import QUICK
 from tests.support.waiting import until
@@ -39,7 +39,6 @@ class Connections:
         self.answered: list[PlainRequest] = []
         """By the fast path."""
         self.fast, self.general = ("", 0), ("", 0)
-        self._stop = threading.Event()
         self._started = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
 
@@ -158,8 +157,7 @@ def infer(
 
 def binary_boards(rows: int, seed: int = 0) -> dict[str, NDArray]:
     """The inputs of the league `board`."""
-    observations = boards(rows, seed)
-    return {name: np.array([one[name] for one in observations], np.int8) for name in observations[0]}
+    return board_arrays(boards(rows, seed))
 
 
 def generated(generator: random.Random) -> bytes:
