@@ -33,66 +33,6 @@ def write(folder: Path, module: str = "own_game", text: str = GAME) -> Path:
     return path
 
 
-def test_the_environment_next_to_the_file_is_found_from_any_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = LeagueConfig.load(write(tmp_path / "project"))
-    monkeypatch.chdir(tmp_path)
-    build(config.environment).close()
-    assert config.folder == str(tmp_path / "project")
-
-
-def test_a_stored_configuration_finds_the_code_in_a_new_process(tmp_path: Path) -> None:
-    stored = LeagueConfig.load(write(tmp_path)).model_dump(mode="json", by_alias=True)
-    entry_points._folders.clear()
-    sys.path.remove(str(tmp_path))
-    build(LeagueConfig.from_mapping(stored).environment).close()
-
-
-def test_the_folder_is_searched_before_the_installed_packages(tmp_path: Path) -> None:
-    write(tmp_path / "installed", text="WHERE = 'installed'")
-    write(tmp_path / "project", text="WHERE = 'project'")
-    sys.path.insert(0, str(tmp_path / "installed"))
-    assert import_entry_point("key", "own_game:WHERE", str(tmp_path / "project")) == "project"
-
-
-def test_a_file_of_the_folder_does_not_replace_a_library(tmp_path: Path) -> None:
-    (tmp_path / "colorsys.py").write_text("raise RuntimeError('shadowed')")
-    config = LeagueConfig.load(write(tmp_path, text="import colorsys\n" + GAME))
-    sys.modules.pop("colorsys", None)
-    build(config.environment).close()
-
-
-def test_modules_of_the_folder_import_each_other(tmp_path: Path) -> None:
-    (tmp_path / "own_rules.py").write_text(GAME)
-    build(LeagueConfig.load(write(tmp_path, text="from own_rules import make_env")).environment).close()
-
-
-def test_the_folder_is_searched_before_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which the command appends to the path."""
-    for name in ("here", "there"):
-        write(tmp_path / name, text="from own_rules import *\n")
-        (tmp_path / name / "own_rules.py").write_text(f"WHERE = {name!r}\n")
-    monkeypatch.chdir(tmp_path / "here")
-    sys.path.append(str(tmp_path / "here"))
-    config = LeagueConfig.load(tmp_path / "there" / "league.yaml")
-    assert import_entry_point("key", "own_game:WHERE", config.folder) == "there"
-
-
-@pytest.mark.parametrize("is_on_path", [True, False], ids=["on the path", "of another league"])
-def test_modules_of_two_leagues_are_not_confused(tmp_path: Path, is_on_path: bool) -> None:
-    for name in ("one", "two"):
-        write(tmp_path / name, f"own_{name}", "from own_rules import *\n")
-        (tmp_path / name / "own_rules.py").write_text(f"WHERE = {name!r}\n")
-    if is_on_path:
-        sys.path.insert(0, str(tmp_path / "one"))
-    else:
-        assert import_entry_point("key", "own_one:WHERE", LeagueConfig.load(tmp_path / "one" / "league.yaml").folder)
-    config = LeagueConfig.load(tmp_path / "two" / "league.yaml")
-    with pytest.raises(ConfigError, match=r"'own_rules' is the name of several modules, .*two.* and .*one.*: rename"):
-        import_module("key", "own_two", config.folder)
-
-
 def test_a_folder_is_relative_to_the_file(tmp_path: Path) -> None:
     write(tmp_path / "source")
     path = tmp_path / "league.yaml"
@@ -101,58 +41,6 @@ def test_a_folder_is_relative_to_the_file(tmp_path: Path) -> None:
     path.write_text("league: own\nfolder: nowhere\nenvironment: {entry_point: 'own_game:make_env'}\n")
     with pytest.raises(ConfigError, match=r"league\.yaml: folder: .*nowhere is not a directory"):
         LeagueConfig.load(path)
-
-
-def test_two_leagues_with_modules_of_one_name_are_an_error(tmp_path: Path) -> None:
-    first, second = (LeagueConfig.load(write(tmp_path / name)) for name in ("a", "b"))
-    build(first.environment).close()
-    with pytest.raises(ConfigError, match="'own_game' is the name of several modules") as raised:
-        build(second.environment)
-    assert f"{tmp_path}/b/own_game.py and {tmp_path}/a/own_game.py" in str(raised.value)
-
-
-def test_the_code_of_two_leagues_with_modules_of_one_name_differs(tmp_path: Path) -> None:
-    write(tmp_path / "a")
-    write(tmp_path / "b", text=GAME + "\n# another rule\n")
-    codes = {environment_code("own_game:make_env", str(tmp_path / name)).source for name in ("a", "b")}
-    assert len(codes) == 2
-
-
-def test_the_folder_is_no_part_of_the_game(tmp_path: Path) -> None:
-    first, second = (LeagueConfig.load(write(tmp_path / name)) for name in ("a", "b"))
-    assert first.game_digest() == second.game_digest()
-    assert str(tmp_path) not in first.environment.model_dump_json()
-
-
-@pytest.mark.parametrize("is_package", [True, False], ids=["package", "folder"])
-@pytest.mark.parametrize(
-    ("module", "text"),
-    [
-        ("training.envs", GAME),
-        ("own_game", "from training.envs import make_env"),
-        ("own_game", "from training import envs"),
-    ],
-)
-def test_a_folder_with_the_name_of_one_of_our_packages_is_to_be_renamed(
-    tmp_path: Path, module: str, text: str, is_package: bool
-) -> None:
-    folder = tmp_path / "training"
-    folder.mkdir()
-    if is_package:
-        (folder / "__init__.py").touch()
-    (folder / "envs.py").write_text(GAME)
-    write(tmp_path, text=text)
-    with pytest.raises(ConfigError) as raised:
-        import_entry_point("environment.entry_point", f"{module}:make_env", str(tmp_path))
-    assert str(raised.value) == (
-        f"environment.entry_point: {folder} has the name of a package of Policy League: rename it"
-    )
-
-
-def test_a_module_with_the_name_of_one_of_our_packages_is_to_be_renamed(tmp_path: Path) -> None:
-    config = LeagueConfig.load(write(tmp_path, "evaluation"))
-    with pytest.raises(ConfigError, match=rf"{tmp_path}/evaluation\.py has the name of a package of Policy League"):
-        build(config.environment)
 
 
 def test_our_own_packages_are_not_to_be_renamed_in_a_clone() -> None:
@@ -178,3 +66,81 @@ def test_an_exception_on_import_names_its_line(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"ZeroDivisionError: division by zero \(.*own_game\.py, line 3\)"):
         import_module("key", "own_game", str(path.parent))
     assert "own_game" not in sys.modules
+
+
+def test_the_environment_next_to_the_file_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From any directory, in a new process, and with the modules that it imports, which do not replace libraries."""
+    folder = tmp_path / "project"
+    config = LeagueConfig.load(write(folder, text="import colorsys\nfrom own_rules import make_env\n"))
+    (folder / "own_rules.py").write_text(GAME)
+    (folder / "colorsys.py").write_text("raise RuntimeError('shadowed')")
+    sys.modules.pop("colorsys", None)
+    monkeypatch.chdir(tmp_path)
+    build(config.environment).close()
+    assert config.folder == str(folder)
+    entry_points._folders.clear()
+    sys.path.remove(str(folder))
+    build(LeagueConfig.from_mapping(config.model_dump(mode="json", by_alias=True)).environment).close()
+
+
+@pytest.mark.parametrize("is_installed", [True, False])
+def test_the_folder_is_searched_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_installed: bool) -> None:
+    """Before the installed packages, and before the working directory, which the command appends to the path."""
+    for name in ("here", "there"):
+        write(tmp_path / name, text=f"WHERE = {name!r}\n" if is_installed else "from own_rules import *\n")
+        (tmp_path / name / "own_rules.py").write_text(f"WHERE = {name!r}\n")
+    monkeypatch.chdir(tmp_path / "here")
+    sys.path.insert(0 if is_installed else len(sys.path), str(tmp_path / "here"))
+    config = LeagueConfig.load(tmp_path / "there" / "league.yaml")
+    assert import_entry_point("key", "own_game:WHERE", config.folder) == "there"
+
+
+@pytest.mark.parametrize("is_on_path", [True, False], ids=["on the path", "of another league"])
+def test_modules_of_two_leagues_are_not_confused(tmp_path: Path, is_on_path: bool) -> None:
+    for name in ("one", "two"):
+        write(tmp_path / name, f"own_{name}", "from own_rules import *\n")
+        (tmp_path / name / "own_rules.py").write_text(f"WHERE = {name!r}\n")
+    if is_on_path:
+        sys.path.insert(0, str(tmp_path / "one"))
+    else:
+        assert import_entry_point("key", "own_one:WHERE", LeagueConfig.load(tmp_path / "one" / "league.yaml").folder)
+    config = LeagueConfig.load(tmp_path / "two" / "league.yaml")
+    with pytest.raises(ConfigError, match=r"'own_rules' is the name of several modules, .*two.* and .*one.*: rename"):
+        import_module("key", "own_two", config.folder)
+
+
+def test_two_leagues_with_modules_of_one_name_are_an_error(tmp_path: Path) -> None:
+    first, second = (LeagueConfig.load(write(tmp_path / name)) for name in ("a", "b"))
+    assert first.game_digest() == second.game_digest(), "the folder is no part of the game"
+    assert str(tmp_path) not in first.environment.model_dump_json()
+    build(first.environment).close()
+    with pytest.raises(ConfigError, match="'own_game' is the name of several modules") as raised:
+        build(second.environment)
+    assert f"{tmp_path}/b/own_game.py and {tmp_path}/a/own_game.py" in str(raised.value)
+    write(tmp_path / "b", text=GAME + "\n# another rule\n")
+    environment_code.cache_clear()
+    codes = {environment_code("own_game:make_env", str(tmp_path / name)).source for name in ("a", "b")}
+    assert len(codes) == 2
+
+
+@pytest.mark.parametrize("is_package", [True, False], ids=["package", "folder"])
+def test_what_has_the_name_of_one_of_our_packages_is_to_be_renamed(tmp_path: Path, is_package: bool) -> None:
+    folder = tmp_path / "training"
+    folder.mkdir()
+    if is_package:
+        (folder / "__init__.py").touch()
+    (folder / "envs.py").write_text(GAME)
+    for module, text in (
+        ("training.envs", GAME),
+        ("own_game", "from training.envs import make_env"),
+        ("own_game", "from training import envs"),
+    ):
+        write(tmp_path, text=text)
+        with pytest.raises(ConfigError) as raised:
+            import_entry_point("environment.entry_point", f"{module}:make_env", str(tmp_path))
+        assert str(raised.value) == (
+            f"environment.entry_point: {folder} has the name of a package of Policy League: rename it"
+        )
+    config = LeagueConfig.load(write(tmp_path, "evaluation"))
+    with pytest.raises(ConfigError, match=rf"{tmp_path}/evaluation\.py has the name of a package of Policy League"):
+        build(config.environment)

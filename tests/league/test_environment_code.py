@@ -29,21 +29,6 @@ def read(entry_point: str = "bricks.game:env") -> EnvironmentCode:
     return environment_code(entry_point)
 
 
-@pytest.mark.parametrize("name", ["game.py", "rules.py", "board.py", "__init__.py"])
-def test_each_imported_module_decides(package: Path, name: str) -> None:
-    before = read()
-    (package / name).write_text((package / name).read_text() + "# edited\n")
-    after = read()
-    assert after.source != before.source
-    assert after.libraries == before.libraries == {"numpy": version("numpy")}
-
-
-def test_modules_that_are_not_imported_do_not_decide(package: Path) -> None:
-    before = read()
-    (package / "train.py").write_text("EPOCHS = 3\n")
-    assert read() == before
-
-
 def test_a_library_is_identified_by_its_version_and_those_of_its_imports() -> None:
     code = read("pettingzoo.classic.leduc_holdem_v4")
     assert code.libraries == {name: version(name) for name in ("gymnasium", "numpy", "pettingzoo", "rlcard")}
@@ -68,46 +53,6 @@ def test_libraries_of_the_system_and_of_other_environments_are_libraries(
     assert read() == code
 
 
-@pytest.mark.parametrize("is_in_folder", [True, False], ids=["folder", "path"])
-def test_code_without_a_distribution_is_source_wherever_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_in_folder: bool
-) -> None:
-    """Such as a project below `site-packages`, or packages that were copied there by hand."""
-    folder = tmp_path / "install" / "site-packages"
-    folder.mkdir(parents=True)
-    (folder / "tiles.py").write_text("import numpy\nWIN = 1\n")
-    if not is_in_folder:
-        monkeypatch.syspath_prepend(str(folder))
-
-    def read() -> EnvironmentCode:
-        environment_code.cache_clear()
-        return environment_code("tiles:env", str(folder) if is_in_folder else None)
-
-    before = read()
-    (folder / "tiles.py").write_text("import numpy\nWIN = 2\n")
-    assert read().source != before.source
-    assert read().libraries == before.libraries == {"numpy": version("numpy")}
-
-
-def test_the_users_module_is_source_although_a_distribution_has_its_name(tmp_path: Path) -> None:
-    folder = tmp_path / "site-packages"
-    folder.mkdir()
-    (folder / "yaml.py").write_text("WIN = 1\n")
-    environment_code.cache_clear()
-    assert environment_code("yaml:env", str(folder)).libraries == {}
-
-
-def test_a_module_that_does_not_exist_has_no_code() -> None:
-    assert read("no_such_package.game:env").libraries == {}
-
-
-def test_a_module_that_is_not_python_is_compared_as_text(package: Path) -> None:
-    (package / "rules.py").write_text("def (:\n")
-    before = read()
-    (package / "rules.py").write_text("def (:  \n")
-    assert read().source != before.source
-
-
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "latin-1"])
 def test_sources_are_read_in_their_encoding(tmp_path: Path, encoding: str) -> None:
     (tmp_path / "tiles.py").write_text(f"# coding: {encoding}\n# für\nimport numpy\nimport grout\n", encoding=encoding)
@@ -115,17 +60,6 @@ def test_sources_are_read_in_their_encoding(tmp_path: Path, encoding: str) -> No
     after = read_in(tmp_path, "tiles:env", grout="WIN = 2\n")
     assert before.source != after.source
     assert before.libraries == after.libraries == {"numpy": version("numpy")}
-
-
-def test_a_module_may_try_an_import_beyond_its_package(tmp_path: Path) -> None:
-    (tmp_path / "tiles.py").write_text(
-        "try:\n    from .grout import WIN\nexcept ImportError:\n    from grout import WIN\n"
-    )
-    assert set(read_in(tmp_path, "tiles:env", grout="WIN = 1\n").files) == {"tiles", "grout"}
-
-
-def test_the_users_module_may_have_a_name_of_the_standard_library(tmp_path: Path) -> None:
-    assert set(read_in(tmp_path, "turtle:env", turtle="import numpy\n").files) == {"turtle"}
 
 
 def test_modules_of_a_league_come_from_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,3 +79,49 @@ def read_in(folder: Path, entry_point: str, **files: str) -> EnvironmentCode:
         (folder / f"{name}.py").write_text(text)
     environment_code.cache_clear()
     return environment_code(entry_point, str(folder))
+
+
+def test_each_imported_module_decides_and_no_other(package: Path) -> None:
+    assert read("no_such_package.game:env").libraries == {}
+    before = read()
+    (package / "train.py").write_text("EPOCHS = 3\n")
+    assert read() == before
+    sources = {before.source}
+    for name in ("game.py", "rules.py", "board.py", "__init__.py"):
+        (package / name).write_text((package / name).read_text() + "# edited\n")
+        code = read()
+        assert code.source not in sources
+        assert code.libraries == before.libraries == {"numpy": version("numpy")}
+        sources.add(code.source)
+    for text in ("def (:\n", "def (:  \n"):  # what is not Python is compared as text
+        (package / "rules.py").write_text(text)
+        assert read().source not in sources
+        sources.add(read().source)
+
+
+@pytest.mark.parametrize("is_in_folder", [True, False], ids=["folder", "path"])
+def test_code_without_a_distribution_is_source_wherever_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_in_folder: bool
+) -> None:
+    """Such as a project below `site-packages`, or packages that were copied there by hand."""
+    folder = tmp_path / "install" / "site-packages"
+    folder.mkdir(parents=True)
+    if not is_in_folder:
+        monkeypatch.syspath_prepend(str(folder))
+    codes = []
+    for text in ("import numpy\nWIN = 1\n", "import numpy\nWIN = 2\n"):
+        (folder / "tiles.py").write_text(text)
+        environment_code.cache_clear()
+        codes.append(environment_code("tiles:env", str(folder) if is_in_folder else None))
+    assert codes[0].source != codes[1].source
+    assert codes[0].libraries == codes[1].libraries == {"numpy": version("numpy")}
+
+
+def test_the_users_modules_may_have_any_name(tmp_path: Path) -> None:
+    """That of a distribution or of the standard library, and may try an import beyond their package."""
+    folder = tmp_path / "site-packages"
+    folder.mkdir()
+    assert read_in(folder, "yaml:env", yaml="WIN = 1\n").libraries == {}
+    assert set(read_in(tmp_path, "turtle:env", turtle="import numpy\n").files) == {"turtle"}
+    tiles = "try:\n    from .grout import WIN\nexcept ImportError:\n    from grout import WIN\n"
+    assert set(read_in(tmp_path, "tiles:env", tiles=tiles, grout="WIN = 1\n").files) == {"tiles", "grout"}

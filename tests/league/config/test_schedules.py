@@ -13,8 +13,14 @@ from league.config.schedules import AnnealingConfig, ScheduleProgress, scheduled
 from league.errors import ConfigError
 
 VALUES = st.floats(min_value=0, max_value=1)
+
+
 STEPS = st.integers(min_value=0, max_value=10**7)
+
+
 FRACTIONS = st.floats(min_value=0, max_value=1)
+
+
 KINDS = st.sampled_from(["linear", "cosine"])
 
 
@@ -65,27 +71,6 @@ def test_two_points_are_a_linear_schedule(initial: float, final: float, length: 
     assert scheduled_value(((0, initial), (length, final)), at(step)) == linear.at(at(step))
 
 
-def test_a_cosine_is_slow_at_both_ends() -> None:
-    cosine = AnnealingConfig(schedule="cosine", initial=1, final=0)
-    values = [cosine.at(at(budget=share)) for share in (0.25, 0.5, 0.75)]
-    assert values == pytest.approx([0.8535534, 0.5, 0.1464466])
-
-
-def test_the_budget_is_of_steps_or_time_whichever_is_spent_first() -> None:
-    assert PPOConfig(steps=1000).budget_spent(250, seconds=9999) == 0.25
-    assert PPOConfig(steps=1000, minutes=2).budget_spent(250, seconds=60) == 0.5
-    assert PPOConfig(steps=1000, minutes=2).budget_spent(2000, seconds=0) == 1
-
-
-def test_a_run_of_minutes_is_not_ended_by_the_default_number_of_steps() -> None:
-    assert PPOConfig().budget_spent(500_000, seconds=9999) == 0.5
-    minutes = PPOConfig(minutes=3)
-    assert minutes.max_steps is None
-    assert minutes.budget_spent(10**9, seconds=90) == 0.5
-    given = league(steps=None).with_training(minutes=3).training
-    assert (given.max_steps, given.minutes) == (None, 3), "--minutes with a configuration without `steps`"
-
-
 def test_an_interval_of_minutes_replaces_the_default_interval_of_steps() -> None:
     assert PPOConfig().checkpoint_steps == 200_000
     assert PPOConfig(checkpoint_minutes=5).checkpoint_steps is None
@@ -114,25 +99,33 @@ def test_schedules_survive_json() -> None:
     assert LeagueConfig.from_mapping(config.model_dump(mode="json", by_alias=True)) == config
 
 
-@pytest.mark.parametrize(
-    ("training", "message"),
-    [
+def test_a_run_of_minutes_is_not_ended_by_the_default_number_of_steps() -> None:
+    assert PPOConfig().budget_spent(500_000, seconds=9999) == 0.5
+    assert PPOConfig(steps=1000, minutes=2).budget_spent(250, seconds=60) == 0.5, "whichever is spent first"
+    assert PPOConfig(steps=1000, minutes=2).budget_spent(2000, seconds=0) == 1
+    minutes = PPOConfig(minutes=3)
+    assert minutes.max_steps is None
+    assert minutes.budget_spent(10**9, seconds=90) == 0.5
+    settings = league(steps=None).with_training(minutes=3).training
+    assert (settings.max_steps, settings.minutes) == (None, 3), "--minutes with a configuration without `steps`"
+    cosine = AnnealingConfig(schedule="cosine", initial=1, final=0)
+    values = [cosine.at(at(budget=share)) for share in (0.25, 0.5, 0.75)]
+    assert values == pytest.approx([0.8535534, 0.5, 0.1464466]), "slow at both ends"
+
+
+def test_a_fault_of_a_schedule_is_reported_with_its_key(subtests: pytest.Subtests) -> None:
+    pairs = "training.clip: expected [step, value] pairs with increasing steps, got "
+    for training, message in (
         ({"lr": 0}, "training.lr: input should be greater than 0, got 0"),
         ({"lr": {"initial": 1}}, "training.lr.final: missing, but required"),
         ({"lr": {"initial": 1, "finall": 0}}, "training.lr.finall: unknown key, did you mean 'final'?"),
         ({"entropy": {"schedule": "cosin", "initial": 1, "final": 0}}, "training.entropy.schedule: input should be"),
         ({"entropy": {"initial": -1, "final": 0}}, "training.entropy.initial: input should be greater than or equal"),
-        ({"clip": []}, "training.clip: expected [step, value] pairs with increasing steps, got []"),
-        ({"clip": [[10, 1], [10, 2]]}, "training.clip: expected [step, value] pairs with increasing steps, got [[10,"),
+        ({"clip": []}, f"{pairs}[]"),
+        ({"clip": [[10, 1], [10, 2]]}, f"{pairs}[[10,"),
         ({"clip": [0.1, 0.2]}, "training.clip[0]: expected a list, got 0.1"),
         ({"per_policy": {"a": {"lr": {"initial": 1}}}}, "training.per_policy.a.lr.final: missing, but required"),
-    ],
-)
-def test_a_fault_of_a_schedule_is_reported_with_its_key(training: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(message)):
-        league(**training)
-
-
-def test_off_policy_algorithms_have_no_schedule_of_the_learning_rate() -> None:
-    with pytest.raises(ConfigError, match=r"training\.lr: expected a number, got"):
-        league(algorithm="dqn", lr={"initial": 1, "final": 0})
+        ({"algorithm": "dqn", "lr": {"initial": 1, "final": 0}}, "training.lr: expected a number, got"),
+    ):
+        with subtests.test(training=training), pytest.raises(ConfigError, match=re.escape(message)):
+            league(**training)

@@ -1,11 +1,13 @@
 """Environments as people write them: agents of any type, spaces in any place, several APIs."""
 
+import itertools
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 
 from league.config.league import LeagueConfig
 from league.environments.apis import RLlibEnv, with_api
@@ -59,49 +61,6 @@ class Rounds(ParallelEnv):
 
     def render_for(self, agent: Any) -> Any:
         return np.full((2, 2, 3), self._ids.index(agent), np.uint8)
-
-
-class Turns(AECEnv):
-    """Five rounds in turns."""
-
-    metadata = {"name": "turns"}  # noqa: RUF012
-
-    def __init__(self, agents: tuple = ("ann", "bob"), late: str = "") -> None:
-        self.possible_agents = list(agents)
-        self._spaces = None if late else (SEEN, TAKEN)
-
-    def observation_space(self, agent: Any) -> Any:
-        return dict.fromkeys(self.possible_agents, self._spaces)[agent][0]
-
-    def action_space(self, agent: Any) -> Any:
-        return dict.fromkeys(self.possible_agents, self._spaces)[agent][1]
-
-    def reset(self, seed: int | None = None, options: dict | None = None) -> None:
-        self._spaces, self._random, self._turn = (SEEN, TAKEN), np.random.default_rng(seed), 0
-        self.agents = list(self.possible_agents)
-        self.rewards = dict.fromkeys(self.agents, 0.0)
-        self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
-        self.terminations, self.truncations = dict.fromkeys(self.agents, False), dict.fromkeys(self.agents, False)
-        self.infos = {agent: {} for agent in self.agents}
-        self.agent_selection = self.agents[0]
-        self._seen = self._random.uniform(-1, 1, 2).astype(np.float32)
-
-    def observe(self, agent: Any) -> Any:
-        return self._seen * (1 if agent == self.possible_agents[0] else -1)
-
-    def step(self, action: Any) -> None:
-        agent = self.agent_selection
-        if self.terminations[agent]:
-            self._was_dead_step(action)
-            return
-        self._turn += 1
-        self._seen = self._random.uniform(-1, 1, 2).astype(np.float32)
-        self._cumulative_rewards[agent] = 0.0
-        self.rewards = {one: float(action) * (one == agent) for one in self.agents}
-        self.agent_selection = self.possible_agents[self._turn % len(self.possible_agents)]
-        if self._turn == 5 * len(self.possible_agents):
-            self.terminations = dict.fromkeys(self.agents, True)
-        self._accumulate_rewards()
 
 
 class MultiAgentEnv:
@@ -187,81 +146,6 @@ def league(entry_point: str, api: str | None = None, **kwargs: Any) -> LeagueCon
     return LeagueConfig.from_mapping({"league": "x", "environment": environment})
 
 
-def rewards(config: LeagueConfig) -> dict[str, float]:
-    """The return of each agent that always takes action 2."""
-    batched = stepping(config.environment, 1)
-    turn = batched.start(each_agent_alone([3], len(batched.agents)))
-    total = dict.fromkeys(batched.agents, 0.0)
-    while turn.batches:
-        turn = batched.step({group: np.full(len(batch), 2) for group, batch in turn.batches.items()})
-        for batch in turn.batches.values():
-            total[batched.agents[batch.agents[0]]] += float(batch.rewards[0])
-        for ending in turn.each_ending():
-            total[batched.agents[ending.agent]] += ending.reward
-    batched.close()
-    return total
-
-
-@pytest.mark.parametrize("entry_point", ["Rounds", "Turns", "Group", "Overriding"])
-@pytest.mark.parametrize("agents", [(0, 1), (("car", 0), ("car", 1)), ("ann", "bob")])
-def test_agents_of_any_type_have_names_in_results_and_keep_their_ids_in_the_environment(
-    entry_point: str, agents: tuple
-) -> None:
-    config = league(entry_point, agents=agents)
-    found = examine(config)
-    assert not [str(finding) for finding in found.findings if finding.severity == "fault"]
-    assert found.interface is not None
-    assert list(found.interface.agents) == list(map(str, agents))
-    assert rewards(config) == dict.fromkeys(map(str, agents), 10.0)
-
-
-def test_a_view_is_requested_for_the_environments_own_agent() -> None:
-    batched = stepping(league("Rounds", agents=(5, 7)).environment, 1)
-    batched.start(each_agent_alone([0], 2))
-    assert batched.render(0, "7").max() == 1
-
-
-def test_two_agents_with_one_name_are_refused() -> None:
-    with pytest.raises(EnvironmentMismatch, match=r"agents 1 and '1' have the same name"):
-        build(league("Rounds", agents=(1, "1")).environment)
-
-
-@pytest.mark.parametrize("late", ["spaces", "agents"])
-@pytest.mark.parametrize("entry_point", ["Rounds", "Turns", "Group"])
-def test_spaces_and_agents_may_exist_only_after_a_reset(entry_point: str, late: str) -> None:
-    config = league(entry_point, late=late)
-    found = examine(config)
-    assert found.passed, found.findings
-    assert rewards(config) == {"ann": 10.0, "bob": 10.0}
-
-
-@pytest.mark.parametrize("where", ["dict", "Dict", "common", "common Dict"])
-@pytest.mark.parametrize("agents", [("ann", "bob"), (0, 1)])
-def test_rllib_spaces_are_found_in_each_form(where: str, agents: tuple) -> None:
-    described = describe(build(league("Group", where=where, agents=agents).environment), league("Group"))
-    assert {spaces.action.n for spaces in described.agents.values()} == {3}  # type: ignore[union-attr]
-
-
-def test_a_missing_space_is_named() -> None:
-    with pytest.raises(EnvironmentMismatch, match="Group has no observation_space for agent 'ann'"):
-        describe(build(league("Group", where="nowhere").environment), league("Group"))
-
-
-@pytest.mark.parametrize(
-    ("api", "expected"), [(None, "Parallel"), ("parallel", "Parallel"), ("rllib", "MultiAgentEnv")]
-)
-def test_an_environment_with_two_apis_is_stepped_by_the_configured_one(api: str | None, expected: str) -> None:
-    found = examine(league("Both", api=api))
-    assert found.api == expected
-    # Its flags fit RLlib's API only.
-    assert found.passed == (api == "rllib"), found.findings
-
-
-def test_an_api_that_an_environment_does_not_have_is_refused() -> None:
-    with pytest.raises(ConfigError, match="returned a Rounds, expected an RLlib MultiAgentEnv"):
-        build(league("Rounds", api="rllib").environment)
-
-
 def test_agents_from_an_unordered_set_are_sorted() -> None:
     """RLlib infers the list from a set, whose order differs between processes."""
     env = Group()
@@ -272,6 +156,86 @@ def test_agents_from_an_unordered_set_are_sorted() -> None:
     assert RLlibEnv(env).possible_agents == ["b", "a"]
 
 
-def test_strings_cost_nothing() -> None:
+def turns(agents: tuple = ("ann", "bob"), late: str = "") -> AECEnv:
+    """`Rounds` in turns."""
+    return Turns(Rounds(agents, late))
+
+
+class Turns(parallel_to_aec_wrapper):
+    """PettingZoo's conversion, which would copy the spaces at once."""
+
+    def __init__(self, env: Rounds) -> None:
+        AECEnv.__init__(self)
+        self.env, self.metadata, self.possible_agents = env, {"name": "turns"}, list(env._ids)
+
+    def observation_space(self, agent: Any) -> Any:
+        return self.env.observation_space(agent)
+
+    def action_space(self, agent: Any) -> Any:
+        return self.env.action_space(agent)
+
+
+def rewards(config: LeagueConfig) -> dict[str, float]:
+    """The return of each agent that always takes action 2."""
+    batched = stepping(config.environment, 1)
+    turn = batched.start(each_agent_alone([3], len(batched.agents)))
+    total = dict.fromkeys(batched.agents, 0.0)
+    while turn.batches:
+        turn = batched.step({group: np.full(len(batch), 2) for group, batch in turn.batches.items()})
+        for group, batch in turn.batches.items():
+            total[batched.agents[group]] += float(batch.rewards[0])
+        for ending in turn.each_ending():
+            total[batched.agents[ending.agent]] += ending.reward
+    batched.close()
+    return total
+
+
+@pytest.mark.parametrize("entry_point", ["Rounds", "turns", "Group", "Overriding"])
+def test_agents_of_any_type_have_names_in_results_and_keep_their_ids_in_the_environment(
+    entry_point: str, subtests: pytest.Subtests
+) -> None:
+    for agents in ((0, 1), (("car", 0), ("car", 1)), ("ann", "bob")):
+        with subtests.test(agents=agents):
+            config = league(entry_point, agents=agents)
+            examination = examine(config)
+            assert not [str(finding) for finding in examination.findings if finding.severity == "fault"]
+            assert examination.interface is not None
+            assert list(examination.interface.agents) == list(map(str, agents))
+            assert rewards(config) == dict.fromkeys(map(str, agents), 10.0)
+
+
+def test_the_environments_own_agents_have_different_names() -> None:
+    batched = stepping(league("Rounds", agents=(5, 7)).environment, 1)
+    batched.start(each_agent_alone([0], 2))
+    assert batched.render(0, "7").max() == 1, "a view is requested for its own agent"
+    with pytest.raises(EnvironmentMismatch, match=r"agents 1 and '1' have the same name"):
+        build(league("Rounds", agents=(1, "1")).environment)
+
+
+def test_spaces_and_agents_may_exist_only_after_a_reset(subtests: pytest.Subtests) -> None:
+    for entry_point, late in itertools.product(("Rounds", "turns", "Group"), ("spaces", "agents")):
+        with subtests.test(entry_point=entry_point, late=late):
+            config = league(entry_point, late=late)
+            examination = examine(config)
+            assert examination.passed, examination.findings
+            assert rewards(config) == {"ann": 10.0, "bob": 10.0}
+
+
+def test_rllib_spaces_are_found_in_each_form() -> None:
+    for where, agents in itertools.product(("dict", "Dict", "common", "common Dict"), (("ann", "bob"), (0, 1))):
+        described = describe(build(league("Group", where=where, agents=agents).environment), league("Group"))
+        assert {spaces.action.n for spaces in described.agents.values()} == {3}  # type: ignore[union-attr]
+    with pytest.raises(EnvironmentMismatch, match="Group has no observation_space for agent 'ann'"):
+        describe(build(league("Group", where="nowhere").environment), league("Group"))
+
+
+def test_an_environment_with_two_apis_is_stepped_by_the_configured_one() -> None:
+    for api, expected in ((None, "Parallel"), ("parallel", "Parallel"), ("rllib", "MultiAgentEnv")):
+        examination = examine(league("Both", api=api))
+        assert examination.api == expected
+        # Its flags fit RLlib's API only.
+        assert examination.passed == (api == "rllib"), examination.findings
+    with pytest.raises(ConfigError, match="returned a Rounds, expected an RLlib MultiAgentEnv"):
+        build(league("Rounds", api="rllib").environment)
     env = Rounds()
-    assert with_api(env, "parallel") is env
+    assert with_api(env, "parallel") is env, "strings cost nothing"

@@ -56,42 +56,6 @@ def config(where: str, **environment: Any) -> LeagueConfig:
     return LeagueConfig.from_mapping({"league": "x", "environment": environment})
 
 
-@pytest.mark.parametrize(
-    ("where", "problem"),
-    [
-        ("constructor", f"{__name__}:Exiting cannot be created ({{}}): ExitCalled"),
-        ("space", f"{__name__}:Exiting: the spaces of agent_0 cannot be read ({{}}): ExitCalled"),
-        ("reset", "the environment raised an exception ({}, reset with seed 0): ExitCalled"),
-        ("step", "the environment raised an exception ({}, step 1 of the episode with seed 0): ExitCalled"),
-    ],
-)
-def test_an_examination_names_the_line(where: str, problem: str) -> None:
-    lines = Path(__file__).read_text().splitlines()
-    line = next(number for number, text in enumerate(lines, 1) if "sys.exit(0)" in text)
-    (fault,) = (finding for finding in examine(config(where)).findings if finding.severity == "fault")
-    assert problem.format(f"{__file__}, line {line}") + ": sys.exit(0) was called" in str(fault)
-
-
-def test_a_wrapper_that_exits_cannot_be_created() -> None:
-    league = config("nowhere", wrappers=[{"name": f"{__name__}:ExitingWrapper"}])
-    with pytest.raises(ConfigError, match=r"cannot be created \(.*\): ExitCalled: sys\.exit\(1\) was called"):
-        build(league.environment)
-
-
-def test_an_episode_that_exits_has_crashed() -> None:
-    stepping = Lockstep(lambda: Exiting("step"), 1, crashes=1)
-    turn = stepping.start(each_agent_alone([5], 2))
-    actions = {group: np.zeros(len(batch), np.int64) for group, batch in turn.batches.items()}
-    assert stepping.step(actions).crashed.tolist() == [0]
-
-
-def test_a_module_that_exits_cannot_be_imported(tmp_path: Path) -> None:
-    (tmp_path / "exits_on_import.py").write_text("import sys\nsys.exit('no display')\n")
-    message = r"fails on import: ExitCalled: sys\.exit\('no display'\) was called \(.*exits_on_import\.py, line 2\)"
-    with pytest.raises(ConfigError, match=message):
-        import_module("environment.entry_point", "exits_on_import", str(tmp_path))
-
-
 def test_what_else_ends_a_process_does_so() -> None:
     with pytest.raises(SystemExit), no_exit:
         raise_sys_exit_with_custom_error_message("The process receives a SIGTERM.", exit_code=1)
@@ -100,3 +64,32 @@ def test_what_else_ends_a_process_does_so() -> None:
     with pytest.raises(ExitCalled, match=r"^sys\.exit\(\) was called$") as exited, no_exit:
         sys.exit()
     assert str(raised_at(exited.value)).startswith(__file__)
+
+
+def test_an_examination_names_the_line(subtests: pytest.Subtests) -> None:
+    lines = Path(__file__).read_text().splitlines()
+    line = next(number for number, text in enumerate(lines, 1) if "sys.exit(0)" in text)
+    place = f"{__file__}, line {line}"
+    for where, problem in (
+        ("constructor", f"{__name__}:Exiting cannot be created ({place})"),
+        ("space", f"{__name__}:Exiting: the spaces of agent_0 cannot be read ({place})"),
+        ("reset", f"the environment raised an exception ({place}, reset with seed 0)"),
+        ("step", f"the environment raised an exception ({place}, step 1 of the episode with seed 0)"),
+    ):
+        with subtests.test(where=where):
+            (fault,) = (finding for finding in examine(config(where)).findings if finding.severity == "fault")
+            assert f"{problem}: ExitCalled: sys.exit(0) was called" in str(fault)
+
+
+def test_what_exits_cannot_be_created_or_imported(tmp_path: Path) -> None:
+    league = config("nowhere", wrappers=[{"name": f"{__name__}:ExitingWrapper"}])
+    with pytest.raises(ConfigError, match=r"cannot be created \(.*\): ExitCalled: sys\.exit\(1\) was called"):
+        build(league.environment)
+    (tmp_path / "exits_on_import.py").write_text("import sys\nsys.exit('no display')\n")
+    message = r"fails on import: ExitCalled: sys\.exit\('no display'\) was called \(.*exits_on_import\.py, line 2\)"
+    with pytest.raises(ConfigError, match=message):
+        import_module("environment.entry_point", "exits_on_import", str(tmp_path))
+    stepping = Lockstep(lambda: Exiting("step"), 1, crashes=1)
+    turn = stepping.start(each_agent_alone([5], 2))
+    crashed = stepping.step({group: np.zeros(len(batch), np.int64) for group, batch in turn.batches.items()}).crashed
+    assert crashed.tolist() == [0], "its episode has crashed"

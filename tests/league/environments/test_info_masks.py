@@ -1,21 +1,48 @@
-"""Masks in infos become part of the observations, for both APIs of PettingZoo."""
+"""Which keys of a Dict observation are the mask, and which are observed; masks in infos join the observations."""
 
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
-from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.classic import tictactoe_v3
 
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
-from league.environments.building import action_space, build, interface
+from league.environments.building import build, interface
 from league.environments.conformance.examination import examine
 from league.environments.lockstep import stock_stepping
-from league.errors import EnvironmentMismatch
-from league.spaces import ACTION_MASK, OBSERVATION, DictSpace
-from tests.conformance.stepping import assert_same_episode, lockstep
+from league.environments.stepping import each_agent_alone
+from league.errors import EnvironmentMismatch, IllegalAction
+from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, inputs
+from tests.conformance.stepping import assert_stepping_conforms
+from tests.support.environments import masked
+from tests.support.environments.masked import ACTIONS, AGENTS, APIS, BOX, ParallelMasked, RLlibMasked
+from tests.support.environments.simultaneous import Simultaneous
+
+
+def masked_league(api: str, space: str, **kwargs: Any) -> LeagueConfig:
+    environment = {"entry_point": f"{masked.__name__}:{api}", "kwargs": {"space": space, **kwargs}}
+    return LeagueConfig.from_mapping({"league": "masked", "environment": environment})
+
+
+def test_with_actions_that_cannot_be_masked_the_key_is_observed_like_any_other() -> None:
+    config = masked_league("ParallelMasked", "obs", continuous=True)
+    assert examine(config, episodes=1).passed
+    observation = interface(config).agents["ann"].observation
+    assert sorted(inputs(observation)) == ["observation.action_mask", "observation.obs"]
+    assert type(observation).model_validate_json(observation.model_dump_json()) == observation
+
+
+class Far(ParallelMasked):
+    """Observes a time in milliseconds since 1970."""
+
+    def __init__(self) -> None:
+        super().__init__("obs")
+
+    def value(self, space: Any = None, key: str = "") -> Any:
+        value = super().value(space, key)
+        return value if space else value | {"obs": np.array([1.7e12, self.rng.uniform()], np.float32)}
 
 
 class InfoMaskTicTacToe(tictactoe_v3.raw_env):
@@ -42,93 +69,143 @@ class InfoMaskTicTacToe(tictactoe_v3.raw_env):
             self.observe(agent)
 
 
-class Countdown(ParallelEnv):
-    """Two agents with two actions each; the second action is legal in odd steps only."""
-
-    metadata: dict[str, Any] = {"name": "countdown"}  # noqa: RUF012
-    possible_agents = ["left", "right"]  # noqa: RUF012
+class Countdown(Simultaneous):
+    """Two agents with two actions each; the second action is legal at odd times only. Masks are in infos."""
 
     def __init__(self, width: int = 2, without: str | None = None) -> None:
+        super().__init__(leaves=(5, 5))
         self._width, self._without = width, without
-
-    def observation_space(self, agent: str) -> spaces.Space:
-        return spaces.Box(0, 10, (1,), np.float32)
 
     def action_space(self, agent: str) -> spaces.Space:
         return spaces.Discrete(2)
 
-    def _report(self) -> tuple[dict, dict]:
-        mask = np.array([1] + [self._left % 2] * (self._width - 1), np.int8)
-        observations = {agent: np.array([self._left], np.float32) for agent in self.agents}
-        return observations, {agent: {"action_mask": mask} for agent in self.agents if agent != self._without}
+    def _masks(self) -> dict[str, Any]:
+        mask = np.array([1] + [self.time % 2] * (self._width - 1), np.int8)
+        return {agent: {"action_mask": mask} for agent in self.possible_agents if agent != self._without}
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
-        self.agents, self._left = list(self.possible_agents), 5
-        return self._report()
+        return super().reset(seed)[0], self._masks()
 
     def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
-        for agent, action in actions.items():
-            if action == 1 and self._left % 2 == 0 and agent != self._without:
-                raise ValueError("illegal action 1")
-        self._left -= 1
-        observations, infos = self._report()
-        ended = dict.fromkeys(self.agents, self._left == 0)
-        rewards = {agent: float(actions[agent]) for agent in self.agents}
-        if self._left == 0:
-            self.agents = []
-        return observations, rewards, ended, dict.fromkeys(ended, False), infos
+        is_illegal = self.time % 2 == 0 and any(action for agent, action in actions.items() if agent != self._without)
+        assert not is_illegal, "illegal action 1"
+        return *super().step(actions)[:-1], self._masks()
 
 
-def tictactoe() -> AECEnv:
-    return InfoMaskTicTacToe()
+def league(environment: type, **kwargs: Any) -> LeagueConfig:
+    entry_point = f"{__name__}:{environment.__name__}"
+    return LeagueConfig.from_mapping({"league": "masks", "environment": {"entry_point": entry_point, "kwargs": kwargs}})
 
 
-def countdown(**kwargs: Any) -> ParallelEnv:
-    return Countdown(**kwargs)
-
-
-def league(entry_point: str, **kwargs: Any) -> LeagueConfig:
-    environment = {"entry_point": f"{__name__}:{entry_point}", "kwargs": kwargs}
-    return LeagueConfig.from_mapping({"league": "masks", "environment": environment})
-
-
-@pytest.mark.parametrize("entry_point", ["tictactoe", "countdown"])
-def test_masks_are_part_of_the_observations(entry_point: str) -> None:
-    for spaces_of_agent in interface(league(entry_point)).agents.values():
+@pytest.mark.parametrize("environment", [InfoMaskTicTacToe, Countdown])
+def test_masks_are_part_of_the_observations(environment: type) -> None:
+    for spaces_of_agent in interface(league(environment)).agents.values():
         assert isinstance(spaces_of_agent.observation, DictSpace)
         assert set(spaces_of_agent.observation.spaces) == {OBSERVATION, ACTION_MASK}
-
-
-@pytest.mark.parametrize("entry_point", ["tictactoe", "countdown"])
-def test_random_legal_actions_follow_the_masks(entry_point: str) -> None:
-    found = examine(league(entry_point), episodes=10)
-    assert found.passed, found.findings
+    examination = examine(league(environment), episodes=10)
+    assert examination.passed, examination.findings
+    plain = EnvironmentConfig(entry_point="pettingzoo.classic.rps_v2")
+    assert not isinstance(
+        interface(LeagueConfig(league="x", environment=plain)).agents["player_0"].observation, DictSpace
+    )
 
 
 def test_episodes_equal_those_of_masks_in_observations() -> None:
-    ours = league("tictactoe").environment
-    stock = EnvironmentConfig(entry_point="pettingzoo.classic.tictactoe_v3")
-    spaces = {agent: action_space(build(stock), agent) for agent in ("player_1", "player_2")}
-    seeds = list(range(8))
-    expected = lockstep(stock_stepping(stock, 4), spaces, seeds)
-    for seed, episode in lockstep(stock_stepping(ours, 4), spaces, seeds).items():
-        assert_same_episode(episode, expected[seed])
+    assert_stepping_conforms(
+        lambda n: stock_stepping(league(InfoMaskTicTacToe).environment, n), tictactoe_v3.env, list(range(8)), num_envs=4
+    )
 
 
-def test_an_agent_without_a_mask_may_take_all_actions() -> None:
-    env = build(league("countdown", without="right").environment)
+def test_masks_in_infos_may_be_missing_but_need_the_width_of_the_actions() -> None:
+    env = build(league(Countdown, without="agent_1").environment)
     observations, _ = env.reset(seed=1)
-    assert observations["right"][ACTION_MASK].tolist() == [1, 1]
-    observations, *_ = env.step({"left": 0, "right": 1})
-    assert observations["left"][ACTION_MASK].tolist() == [1, 0]
+    assert observations["agent_1"][ACTION_MASK].tolist() == [1, 1], "without a mask all actions are legal"
+    observations, *_ = env.step({"agent_0": 0, "agent_1": 1})
+    assert observations["agent_0"][ACTION_MASK].tolist() == [1, 1]
+    with pytest.raises(EnvironmentMismatch, match=r"'agent_0' has an action_mask of shape \[3\], expected \[2\]"):
+        build(league(Countdown, width=3).environment).reset(seed=1)
 
 
-def test_a_mask_of_another_width_is_rejected() -> None:
-    env = build(league("countdown", width=3).environment)
-    with pytest.raises(EnvironmentMismatch, match=r"agent 'left' has an action_mask of shape \[3\], expected \[2\]"):
-        env.reset(seed=1)
+@pytest.mark.parametrize("api", APIS)
+def test_the_mask_counts_whatever_the_other_keys_are_called_and_all_are_observed(
+    api: str, subtests: pytest.Subtests
+) -> None:
+    for space, names in (
+        ("obs", ["observation", "action_mask"]),
+        ("nested", ["observation.a", "observation.b", "action_mask"]),
+        ("secret", ["observation.observation", "observation.secret", "action_mask"]),
+        ("multi", ["observation", "action_mask"]),
+    ):
+        with subtests.test(space=space):
+            config = masked_league(api, space)
+            examination = examine(config, episodes=1)
+            assert examination.passed, examination.findings
+            assert list(inputs(interface(config).agents["ann"].observation)) == names
+            stepping = stock_stepping(config.environment, 1)
+            turn = stepping.start(each_agent_alone([0], 2))
+            assert list(turn.batches[0].observations) == names
+            illegal = np.array([[0, 1]]) if space in ACTIONS else np.array([1])
+            with pytest.raises(IllegalAction, match="action_mask is"):
+                stepping.step(dict.fromkeys(turn.batches, illegal))
 
 
-def test_an_environment_without_masks_is_returned_as_it_is() -> None:
-    config = LeagueConfig.from_mapping({"league": "x", "environment": {"entry_point": "pettingzoo.classic.rps_v2"}})
-    assert not isinstance(interface(config).agents["player_0"].observation, DictSpace)
+def test_a_mask_that_does_not_fit_is_refused_with_both_sizes() -> None:
+    for space, reason in (
+        ("joint", r"action_mask has the shape \[2, 3\], expected \[5\]: one number for each choice of"),
+        ("short", r"action_mask has the shape \[2\], expected \[3\]: one number for each action"),
+        ("parts", r"action_mask is a Dict, expected \[3\]"),
+        ("only", "observations contain only action_mask: expected at least one more key"),
+    ):
+        with pytest.raises(EnvironmentMismatch, match=f"agent ann: {reason}"):
+            interface(masked_league("ParallelMasked", space))
+
+
+class InfoMasks:
+    """Masks in infos only, after reset or only after a step. The observation has two other keys."""
+
+    def __init__(self, late: bool = False) -> None:
+        super().__init__(space="obs")  # type: ignore[call-arg]
+        self.late = late
+        self.observed = spaces.Dict({"obs": BOX, "secret": BOX})
+        self.observation_spaces = dict.fromkeys(AGENTS, self.observed)
+        self.masks = {agent: {"action_mask": np.array([1, 0, 1])} for agent in AGENTS}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed=seed)[0], {} if self.late else self.masks  # type: ignore[misc]
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        return *super().step(actions)[:-1], self.masks  # type: ignore[misc]
+
+    def move(self, action: Any) -> None:
+        super().move(np.int64(0) if self.late else action)  # type: ignore[misc]
+
+
+class ParallelInfoMasks(InfoMasks, ParallelMasked): ...
+
+
+class RLlibInfoMasks(InfoMasks, RLlibMasked): ...
+
+
+@pytest.mark.parametrize("environment", [ParallelInfoMasks, RLlibInfoMasks])
+def test_masks_in_infos_join_observations_with_several_keys(environment: type) -> None:
+    config = league(environment)
+    examination = examine(config, episodes=1)
+    assert examination.passed, examination.findings
+    stepping = stock_stepping(config.environment, 1)
+    turn = stepping.start(each_agent_alone([0], 2))
+    assert list(turn.batches[0].observations) == ["observation.obs", "observation.secret", "action_mask"]
+    with pytest.raises(IllegalAction, match=r"action_mask is \[1, 0, 1\]"):
+        stepping.step({group: np.array([1]) for group in turn.batches})
+    late = examine(league(environment, late=True), episodes=1)
+    assert "gets a mask in its info after a step, but no agent gets one after reset" in str(late.findings)
+
+
+def test_observations_for_which_gradients_overflow_are_a_fault_unless_they_are_normalised() -> None:
+    for normalized in (False, True):
+        config = LeagueConfig.from_mapping(
+            league(Far).model_dump(by_alias=True) | {"training": {"normalize_observations": normalized}}
+        )
+        examination = examine(config, episodes=1)
+        assert examination.passed == normalized
+        overflow = "1.7e+12 in observation: training needs values of at most 1e+09"
+        assert (overflow in str(examination.findings)) != normalized

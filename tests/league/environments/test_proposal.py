@@ -1,5 +1,6 @@
 """Proposed configurations: what agents, spaces and measured play decide."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -53,22 +54,24 @@ def test_the_network_fits_the_observations() -> None:
     assert training(examined(), spaces(shape=(6, 7, 2)))["convolutions"] == [{"filters": 32, "kernel": 3}]
     assert len(training(examined(), spaces(shape=(84, 84, 3), low=0, high=255))["convolutions"]) == 3
     assert len(training(examined(), spaces(shape=(84, 84, 3)), spaces(shape=(8, 8, 3)))["convolutions"]) == 1
-
-
-def test_images_with_their_channels_first_get_convolutions_over_the_other_axes() -> None:
     settings = training(examined(), spaces(shape=(4, 84, 84), low=0, high=255))
     assert (settings["channels"], len(settings["convolutions"])) == ("first", 3)
     assert training(examined(), spaces(shape=(84, 84, 4), low=0, high=255))["channels"] == "last"
     mixed = training(examined(), spaces(shape=(84, 84, 3)), spaces(shape=(3, 84, 84)))
     assert ("channels" in mixed, len(mixed["convolutions"])) == (False, 3)
+    assert "normalize_observations" not in training(examined(), spaces(low=-1, high=1))
+    for low, high in ((None, None), (0, 1000), (0, None), ([0, 0, 0, None], 1)):
+        assert training(examined(), spaces(low=low, high=high))["normalize_observations"] is True
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [(-1, 1, None), (None, None, True), (0, 1000, True), (0, None, True), ([0, 0, 0, None], 1, True)],
-)
-def test_wide_observations_are_normalised(low: Any, high: Any, expected: bool | None) -> None:
-    assert training(examined(), spaces(low=low, high=high)).get("normalize_observations") is expected
+def test_values_survive_yaml(tmp_path: Path) -> None:
+    for value in ("a.b:c", "yes", "a: b", "..", "#", "", "a'b\"", {"game": "x", "n": [1, True]}, [None]):
+        assert yaml.safe_load(f"key: {_inline(value)}  # comment") == {"key": value}
+    environment = {"entry_point": "openspiel", "kwargs": {"game": "kuhn_poker"}}
+    document = yaml.safe_load("\n".join(map(str, _header(config(), environment, None))))
+    assert document == {"league": "tictactoe", "environment": environment}
+    with pytest.raises(ConfigError, match="nowhere_to_be_found"):
+        propose("mine", "nowhere_to_be_found:make_env", {}, str(tmp_path))
 
 
 def test_the_algorithm_fits_the_actions() -> None:
@@ -115,21 +118,3 @@ def test_policies_and_sides() -> None:
     assert document["policies"]["policy_0"] == [f"player_{number}" for number in range(9)], "a pattern fits others"
     assert document["sides"] is None
     assert parsed(_policies(many, is_team=True))["sides"] == {"team": ["*"]}
-
-
-@pytest.mark.parametrize(
-    "value", ["a.b:c", "yes", "a: b", "..", "#", "", "a'b\"", {"game": "x", "n": [1, True]}, [None]]
-)
-def test_values_survive_yaml(value: Any) -> None:
-    assert yaml.safe_load(f"key: {_inline(value)}  # comment") == {"key": value}
-
-
-def test_the_header_names_the_environment() -> None:
-    environment = {"entry_point": "openspiel", "kwargs": {"game": "kuhn_poker"}}
-    document = yaml.safe_load("\n".join(map(str, _header(config(), environment, None))))
-    assert document == {"league": "tictactoe", "environment": environment}
-
-
-def test_an_environment_that_cannot_be_built_is_refused(tmp_path: Any) -> None:
-    with pytest.raises(ConfigError, match="nowhere_to_be_found"):
-        propose("mine", "nowhere_to_be_found:make_env", {}, str(tmp_path))

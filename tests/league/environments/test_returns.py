@@ -72,88 +72,71 @@ class WrongTurns(TurnMasked):
 STEP = "observations, rewards, terminations, truncations, infos"
 
 
-@pytest.mark.parametrize(
-    ("environment", "change", "message"),
-    [
-        ("WrongParallel", "rewards None", r"step returned None as rewards: expected a dictionary by agent \(step 1 of"),
-        ("WrongParallel", "a reward None", r"agent bob got the reward None: expected a number \(step 1 of the episode"),
-        ("WrongParallel", "a reward array", r"agent bob got the reward array\(\[1.\]\) \(ndarray\): expected a number"),
-        ("WrongParallel", "rewards list", r"step returned \[1.0, 1.0\] \(list\) as rewards: expected a dictionary by"),
-        ("WrongParallel", "four values", rf"step returned 4 values: expected {STEP} \(the former dones are"),
-        ("WrongParallel", "one value", r"reset returned one dict: expected observations, infos \(reset with seed 0\)"),
-        ("WrongParallel", "flag array", r"step returned \[False\] \(list\) as a flag of ann: expected True or"),
-        ("WrongParallel", "no infos", "step returned None as infos: expected a dictionary by agent"),
-        ("WrongParallel", "no observation", "bob observes NoneType, but its space is Dict"),
+def config(cls: type, **settings: Any) -> EnvironmentConfig:
+    return EnvironmentConfig(entry_point=f"{__name__}:{cls.__name__}", **settings)
+
+
+def fault(cls: type, change: str, **settings: Any) -> str:
+    """The only finding."""
+    environment = config(cls, kwargs={"change": change}, **settings)
+    (finding,) = examine(LeagueConfig(league="x", environment=environment), episodes=1).findings
+    return str(finding)
+
+
+def test_check_env_says_what_was_returned_by_whom_and_what_was_expected(subtests: pytest.Subtests) -> None:
+    for cls, change, message in (
+        (WrongParallel, "rewards None", r"step returned None as rewards: expected a dictionary by agent \(step 1 of"),
+        (WrongParallel, "a reward None", r"agent bob got the reward None: expected a number \(step 1 of the episode"),
+        (WrongParallel, "a reward array", r"agent bob got the reward array\(\[1.\]\) \(ndarray\): expected a number"),
+        (WrongParallel, "rewards list", r"step returned \[1.0, 1.0\] \(list\) as rewards: expected a dictionary by"),
+        (WrongParallel, "four values", rf"step returned 4 values: expected {STEP} \(the former dones are"),
+        (WrongParallel, "one value", r"reset returned one dict: expected observations, infos \(reset with seed 0\)"),
+        (WrongParallel, "flag array", r"step returned \[False\] \(list\) as a flag of ann: expected True or"),
+        (WrongParallel, "no infos", "step returned None as infos: expected a dictionary by agent"),
+        (WrongParallel, "no observation", "bob observes NoneType, but its space is Dict"),
         (
-            "WrongParallel",
+            WrongParallel,
             "a mask of a wrong size",
             r"bob observes action_mask with shape \[2\], but its space has \[3\]",
         ),
-        ("WrongParallel", "another key", "bob observes a dict with x, but its space is Dict"),
-        ("WrongParallel", "done", "has left the environment neither terminated nor truncated: both need its key"),
-        ("WrongRLlib", "a reward None", "agent bob got the reward None: expected a number"),
-        ("WrongRLlib", "four values", rf"step returned 4 values: expected {STEP}"),
-        ("WrongTurns", "a reward None", "agent ann got the reward None: expected a number"),
-        ("WrongTurns", "four values", "last returned 4 values: expected observation, reward, termination, truncation"),
-    ],
-)
-def test_check_env_says_what_was_returned_by_whom_and_what_was_expected(
-    environment: str, change: str, message: str
-) -> None:
-    config = EnvironmentConfig(entry_point=f"{__name__}:{environment}", kwargs={"change": change})
-    (fault,) = [str(each) for each in examine(LeagueConfig(league="x", environment=config), episodes=1).findings]
-    assert "raised an exception" not in fault
-    assert re.search(message, fault), fault
+        (WrongParallel, "another key", "bob observes a dict with x, but its space is Dict"),
+        (WrongParallel, "done", "has left the environment neither terminated nor truncated: both need its key"),
+        (WrongRLlib, "a reward None", "agent bob got the reward None: expected a number"),
+        (WrongRLlib, "four values", rf"step returned 4 values: expected {STEP}"),
+        (WrongTurns, "a reward None", "agent ann got the reward None: expected a number"),
+        (WrongTurns, "four values", "last returned 4 values: expected observation, reward, termination, truncation"),
+    ):
+        with subtests.test(environment=cls.__name__, change=change):
+            text = fault(cls, change)
+            assert "raised an exception" not in text
+            assert re.search(message, text), text
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_check_env_says_what_a_wrapper_failed_on(subtests: pytest.Subtests) -> None:
+    for change, message in (
         ("a reward None", "agent bob got the reward None: expected a number (below its wrappers, "),
         ("four values", f"step returned 4 values: expected {STEP}"),
-    ],
-)
-def test_check_env_says_what_a_wrapper_failed_on(change: str, message: str) -> None:
-    config = EnvironmentConfig(
-        entry_point=f"{__name__}:WrongParallel", kwargs={"change": change}, wrappers=("clip_reward_v0",)
-    )
-    (fault,) = [str(finding) for finding in examine(LeagueConfig(league="x", environment=config), episodes=1).findings]
-    assert message in fault
-    assert "raised an exception" not in fault
+        ("raises", "the environment raised an exception"),
+    ):
+        with subtests.test(change=change):
+            text = fault(WrongParallel, change, wrappers=("clip_reward_v0",))
+            assert message in text
+            assert ("raised an exception" in text) == ("division by zero" in text) == (change == "raises")
 
 
-def test_an_exception_of_a_wrapped_environment_stays_one() -> None:
-    config = EnvironmentConfig(
-        entry_point=f"{__name__}:WrongParallel", kwargs={"change": "raises"}, wrappers=("clip_reward_v0",)
-    )
-    (fault,) = [str(finding) for finding in examine(LeagueConfig(league="x", environment=config), episodes=1).findings]
-    assert "the environment raised an exception" in fault
-    assert "division by zero" in fault
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_training_says_it_too(subtests: pytest.Subtests) -> None:
+    for change, message in (
         (
             "a reward array",
             r"agent bob got the reward array\(\[1.\]\) \(ndarray\): expected a number, in the episode with",
         ),
         ("four values", r"step returned 4 values: expected .*, in the episode with seed 5"),
         ("another key", r"agent bob observes {'x': 1} \(dict\): expected the keys of its observation space, in the"),
-    ],
-)
-def test_training_says_it_too(change: str, message: str) -> None:
-    config = EnvironmentConfig(entry_point=f"{__name__}:WrongParallel", kwargs={"change": change})
-    stepping = stock_stepping(config, 1, crashes=3)
-    turn = stepping.start(each_agent_alone([5], 2))
-    with pytest.raises(InvalidReturn, match=message):
-        stepping.step({group: np.zeros(1, np.int64) for group in turn.batches})
-
-
-def test_training_says_what_reset_returned() -> None:
-    config = EnvironmentConfig(entry_point=f"{__name__}:WrongParallel", kwargs={"change": "one value"})
-    with pytest.raises(InvalidReturn, match="reset returned one dict: expected observations, infos, in the episode"):
-        stock_stepping(config, 1, crashes=3).start(each_agent_alone([5], 2))
+        ("one value", "reset returned one dict: expected observations, infos, in the episode"),
+    ):
+        stepping = stock_stepping(config(WrongParallel, kwargs={"change": change}), 1, crashes=3)
+        with subtests.test(change=change), pytest.raises(InvalidReturn, match=message):
+            stepping.step(dict.fromkeys(stepping.start(each_agent_alone([5], 2)).batches, np.zeros(1, np.int64)))
 
 
 class BinaryActions(ParallelMasked):
@@ -163,8 +146,7 @@ class BinaryActions(ParallelMasked):
 
 
 def test_actions_that_cannot_be_learnt_are_refused_before_any_game() -> None:
-    config = EnvironmentConfig(entry_point=f"{__name__}:BinaryActions")
-    faults = [str(each) for each in examine(LeagueConfig(league="x", environment=config), episodes=1).findings]
-    assert faults == [
+    (finding,) = examine(LeagueConfig(league="x", environment=config(BinaryActions)), episodes=1).findings
+    assert str(finding) == (
         "ann and 1 more: has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats"
-    ]
+    )

@@ -33,25 +33,6 @@ def test_samples_of_a_space_are_legal(seed: int) -> None:
         check(space, np.stack([space.sample(), space.sample()]))
 
 
-@pytest.mark.parametrize(
-    ("space", "illegal"),
-    [
-        (spaces.Discrete(4, start=-2), 2),
-        (spaces.Discrete(4), -1),
-        (spaces.MultiDiscrete([2, 3]), [1, 3]),
-        (spaces.MultiDiscrete([2, 3], start=[1, 1]), [0, 1]),
-        (spaces.Box(-1, 1, (2,)), [0.0, 1.01]),
-        (spaces.Box(-1, 1, (2,)), [0.0, np.nan]),
-        (spaces.Box(-np.inf, np.inf, (2,)), [0.0, np.inf]),
-        (spaces.MultiBinary(2), [0, 2]),
-    ],
-)
-def test_an_action_outside_its_space_is_rejected_with_its_agent(space: spaces.Space, illegal: object) -> None:
-    space.seed(0)
-    with pytest.raises(IllegalAction, match=r"action .* of second is illegal"):
-        check(space, np.stack([space.sample(), np.asarray(illegal)]))
-
-
 def test_masks_apply_per_element() -> None:
     space, mask = spaces.MultiDiscrete([2, 3]), np.array([1, 0, 0, 1, 1], np.int8)
     check(space, np.array([[0, 1], [0, 2]]), mask)
@@ -70,7 +51,20 @@ def test_a_mask_that_allows_no_action_is_detected() -> None:
     assert allows_nothing(np.array([[0, 0, 0, 0, 0], [0, 0, 0, 0, 1]], np.int8), one).tolist() == [True, False]
 
 
-def test_the_number_and_shape_of_actions_are_checked() -> None:
+def test_an_action_outside_its_space_is_rejected_with_its_agent(subtests: pytest.Subtests) -> None:
+    for space, illegal in (
+        (spaces.Discrete(4, start=-2), 2),
+        (spaces.Discrete(4), -1),
+        (spaces.MultiDiscrete([2, 3]), [1, 3]),
+        (spaces.MultiDiscrete([2, 3], start=[1, 1]), [0, 1]),
+        (spaces.Box(-1, 1, (2,)), [0.0, 1.01]),
+        (spaces.Box(-1, 1, (2,)), [0.0, np.nan]),
+        (spaces.Box(-np.inf, np.inf, (2,)), [0.0, np.inf]),
+        (spaces.MultiBinary(2), [0, 2]),
+    ):
+        space.seed(0)
+        with subtests.test(space=str(space)), pytest.raises(IllegalAction, match=r"action .* of second is illegal"):
+            check(space, np.stack([space.sample(), np.asarray(illegal)]))
     with pytest.raises(IllegalAction, match="1 actions for 2 agents"):
         check(spaces.Discrete(3), np.array([1]))
     with pytest.raises(IllegalAction, match=r"have shape \[1\], not \[2\]"):
@@ -83,15 +77,9 @@ def test_the_crash_after_the_most_is_raised(caplog: pytest.LogCaptureFixture) ->
     crashes.count(1, 8, ValueError("second"))
     assert "seed 8" in caplog.messages[1]
     assert "(2 of 2 consecutive times): ValueError: second" in caplog.messages[1]
+    crashes.count(0, 8, ValueError("first"))
+    crashes.finish(np.array([0]))
+    for _ in range(2):  # a finished episode ends the count of its environment
+        crashes.count(0, 0, ValueError("again"))
     with pytest.raises(ValueError, match="third"):
         crashes.count(1, 9, ValueError("third"))
-
-
-def test_a_finished_episode_ends_the_count_of_its_environment() -> None:
-    crashes = CrashLimit(num_envs=2, most=1)
-    for env in (0, 1):
-        crashes.count(env, 0, ValueError("first"))
-    crashes.finish(np.array([0]))
-    crashes.count(0, 0, ValueError("second"))
-    with pytest.raises(ValueError, match="second"):
-        crashes.count(1, 0, ValueError("second"))

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from league.config.environment import EnvironmentConfig
 from league.environments.implementation import implementation, stepping
 from league.environments.lockstep import stock_stepping
-from league.environments.stepping import Batch, BatchedEnvironment, Starts, States, Turn
+from league.environments.stepping import Batch, BatchedEnvironment, Starts, Turn
 from league.environments.vector.leduc_holdem import LeducHoldem
 from league.environments.vector.vector_env import AgentRows
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward
 from league.spaces import ACTION_MASK
+from tests.conformance.stepping import states_of
 from tests.support.environments import vector_copies
 from tests.support.environments.episodes import episodes
 
@@ -91,13 +92,6 @@ def assert_same_rows(found: AgentRows | Batch, expected: AgentRows | Batch) -> N
             assert own.shape == column.shape
 
 
-def assert_same_states(found: States | None, expected: States | None) -> None:
-    assert (found is None) == (expected is None)
-    if found is not None and expected is not None:
-        np.testing.assert_array_equal(found.envs, expected.envs)
-        np.testing.assert_array_equal(found.values, expected.values)
-
-
 def assert_same_turn(found: Turn, expected: Turn) -> None:
     assert list(found.batches) == list(expected.batches)
     for group, batch in expected.batches.items():
@@ -107,8 +101,8 @@ def assert_same_turn(found: Turn, expected: Turn) -> None:
         assert_same_rows(mine, other)
     np.testing.assert_array_equal(found.finished, expected.finished)
     np.testing.assert_array_equal(found.crashed, expected.crashed)
-    assert_same_states(found.states, expected.states)
-    assert_same_states(found.last_states, expected.last_states)
+    np.testing.assert_equal(states_of(found.states), states_of(expected.states))
+    np.testing.assert_equal(states_of(found.last_states), states_of(expected.last_states))
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
@@ -128,42 +122,6 @@ def test_turns_equal_those_of_lockstep(name: str, seed: int, num_envs: int) -> N
 
 def zeros(turn: Turn) -> dict[int, NDArray]:
     return {group: np.zeros(len(batch), np.int64) for group, batch in turn.batches.items()}
-
-
-def started(config: EnvironmentConfig, seeds: Iterable[int], num_envs: int, **options: Any) -> Any:
-    env = stepping(config, num_envs, **options)
-    return env, env.start(episodes(seeds, range(len(env.agents))))
-
-
-def test_an_environment_that_raises_too_often_is_named() -> None:
-    env, turn = started(copied("VectorMeeting", crashes=[3]), range(5), 5)
-    turn = env.step(zeros(turn))
-    with pytest.raises(RuntimeError, match="simulator is gone"):
-        env.step(zeros(turn))
-    assert env.busy.tolist() == [3]
-
-
-def test_a_fault_of_the_vectorised_environment_alone_is_reported() -> None:
-    env, turn = started(copied("Faulty"), range(50), 4, crashes=3)
-    for _ in range(2):
-        turn = env.step(zeros(turn))
-    with pytest.raises(EnvironmentMismatch, match="the stock environment does not: ArithmeticError: the array is on"):
-        env.step(zeros(turn))
-
-
-def test_a_reward_that_is_not_finite_is_rejected() -> None:
-    env, turn = started(copied("VectorMeeting", bad_reward=float("nan")), [12, 13], 2, crashes=3)
-    with pytest.raises(InvalidReward, match="agent_0 got a reward of nan in the episode with seed 12"):
-        env.step(zeros(turn))
-
-
-def test_an_illegal_action_is_rejected_before_any_step() -> None:
-    env, turn = started(copied("VectorMeeting"), [0, 1], 2)
-    actions = zeros(turn)
-    actions[1][1] = 3
-    with pytest.raises(IllegalAction, match="action 3 of agent_1"):
-        env.step(actions)
-    assert set(env.step(zeros(turn)).batches) == {0, 1}
 
 
 def test_a_fault_with_fast_seeds_is_not_sought_in_the_stock_environment(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,3 +153,28 @@ def test_time_is_shared_by_the_environments_of_a_call(monkeypatch: pytest.Monkey
     env.step(zeros(turn))
     assert (env.seconds() - before).tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3, 0.0])
     assert env.busy.tolist() == []
+
+
+def started(config: EnvironmentConfig, seeds: Iterable[int], num_envs: int, **options: Any) -> Any:
+    env = stepping(config, num_envs, **options)
+    return env, env.start(episodes(seeds, range(len(env.agents))))
+
+
+def test_faults_are_named() -> None:
+    env, turn = started(copied("VectorMeeting", crashes=[3]), range(5), 5)
+    turn = env.step(zeros(turn))
+    with pytest.raises(RuntimeError, match="simulator is gone"):
+        env.step(zeros(turn))
+    assert env.busy.tolist() == [3]
+    env, turn = started(copied("Faulty"), range(50), 4, crashes=3)
+    for _ in range(2):
+        turn = env.step(zeros(turn))
+    with pytest.raises(EnvironmentMismatch, match="the stock environment does not: ArithmeticError: the array is on"):
+        env.step(zeros(turn))
+    env, turn = started(copied("VectorMeeting", bad_reward=float("nan")), [12, 13], 2, crashes=3)
+    with pytest.raises(InvalidReward, match="agent_0 got a reward of nan in the episode with seed 12"):
+        env.step(zeros(turn))
+    env, turn = started(copied("VectorMeeting"), [0, 1], 2)
+    with pytest.raises(IllegalAction, match="action 3 of agent_1"):
+        env.step(zeros(turn) | {1: np.array([0, 3])})
+    assert set(env.step(zeros(turn)).batches) == {0, 1}

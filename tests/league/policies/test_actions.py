@@ -13,15 +13,9 @@ from league.spaces.arrays import bounds
 from league.spaces.conversion import from_gymnasium, to_gymnasium
 
 PAIRS = MultiDiscrete(nvec=[[2, 3], [4, 5]], start=[[0, 1], [2, 3]], shape=(2, 2))
+
+
 MIXED = Box(dtype="float32", shape=(2, 2), low=[[-1.0, 0.0], [None, None]], high=[[3.0, None], [5.0, None]])
-
-
-@pytest.mark.parametrize(
-    ("space", "size"),
-    [(Discrete(n=5, start=2), 5), (PAIRS, 14), (MIXED, 8), (Box(dtype="float64", shape=(), low=0, high=1), 2)],
-)
-def test_the_size_of_the_distribution_inputs(space: Space, size: int) -> None:
-    assert dist_inputs_size(space) == size
 
 
 def test_integers_start_at_the_start_of_their_space() -> None:
@@ -66,22 +60,17 @@ def test_actions_of_the_environment_become_raw_actions(seed: int, space: Space) 
     assert np.allclose(to_environment(raw, space), actions, atol=1e-5)
 
 
-def test_bounds_have_the_shape_of_the_space() -> None:
+def test_the_size_of_the_distribution_inputs() -> None:
+    number = Box(dtype="float64", shape=(), low=0, high=1)
+    assert [dist_inputs_size(space) for space in (Discrete(n=5, start=2), PAIRS, MIXED, number)] == [5, 14, 8, 2]
     low, high = bounds(Box(dtype="float32", shape=(2, 3), low=None, high=1))
     assert (low == np.full((2, 3), -np.inf)).all()
     assert (high == np.ones((2, 3))).all()
 
 
-@pytest.mark.parametrize(
-    "space",
-    [
-        Box(dtype="int8", shape=(2,), low=0, high=1),
-        MultiBinary(shape=(2,)),
-        DictSpace(spaces={"move": Discrete(n=2)}),
-    ],
-)
-def test_unsupported_action_spaces_are_rejected(space: Space) -> None:
-    with pytest.raises(ConfigError, match="expected Discrete, MultiDiscrete or a Box of floats"):
-        dist_inputs_size(space)
-    with pytest.raises(ConfigError, match="expected Discrete, MultiDiscrete or a Box of floats"):
-        to_environment(np.zeros((1, 2)), space)
+def test_unsupported_action_spaces_are_rejected() -> None:
+    integers, binary = Box(dtype="int8", shape=(2,), low=0, high=1), MultiBinary(shape=(2,))
+    for space in (integers, binary, DictSpace(spaces={"move": Discrete(n=2)})):
+        for use in (dist_inputs_size, lambda space: to_environment(np.zeros((1, 2)), space)):
+            with pytest.raises(ConfigError, match="expected Discrete, MultiDiscrete or a Box of floats"):
+                use(space)

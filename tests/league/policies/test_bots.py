@@ -1,7 +1,5 @@
 """Bots as policies."""
 
-import re
-
 import numpy as np
 import pytest
 
@@ -13,9 +11,17 @@ from league.spaces import Box, DictSpace, Discrete
 from tests.support.policies.bots import MODULE
 
 BOARD = Box(dtype="int8", shape=(3,), low=0, high=1)
+
+
 OBSERVATION = DictSpace(spaces={"observation": BOARD, "action_mask": Box(dtype="int8", shape=(4,), low=0, high=1)})
+
+
 ACTION = Discrete(n=4)
+
+
 MASKS = np.array([[0, 1, 1, 1], [1, 0, 0, 1]], np.int8)
+
+
 BATCH = {"observation": np.zeros((2, 3), np.int8), "action_mask": MASKS}
 
 
@@ -25,17 +31,6 @@ def bot(name: str) -> Bot:
 
 def generators(seed: int = 0) -> list[np.random.Generator]:
     return [np.random.default_rng((seed, row)) for row in range(2)]
-
-
-@pytest.mark.parametrize("name", ["first", "all_at_once"])
-def test_functions_act_row_by_row_or_on_batches(name: str) -> None:
-    assert bot(name).act(BATCH).actions.tolist() == [1, 0]
-
-
-def test_a_row_uses_its_own_generator() -> None:
-    both = bot("sampled").act(BATCH, rng=generators()).actions
-    second = {name: array[1:] for name, array in BATCH.items()}
-    assert bot("sampled").act(second, rng=generators()[1:]).actions.tolist() == [both[1]]
 
 
 def test_an_instance_plays_one_agent_for_one_episode() -> None:
@@ -60,26 +55,6 @@ def test_an_exception_is_a_fault_of_its_row() -> None:
     assert [(row, str(fault)) for row, fault in answer.faults.items()] == [(1, "no idea")]
 
 
-def test_a_wrong_return_value_is_a_malformed_action() -> None:
-    faults = bot("text").act(BATCH).faults
-    assert all(isinstance(fault, MalformedAction) for fault in faults.values())
-    assert re.search("returned str 'left': expected int64", str(faults[1]))
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        (f"{MODULE}:missing", "bots.py\\) has no 'missing'"),
-        (f"{MODULE}:NOT_A_BOT", "is a int: expected a function, or a class with a method `act`"),
-        (f"{MODULE}:needs_more", "requires 'depth': expected the arguments observation, action_mask and rng"),
-        ("no_such_module:act", "cannot import 'no_such_module': .*; searched: "),
-    ],
-)
-def test_what_is_not_a_bot_is_rejected(name: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=f"script:{name}.*{message}"):
-        script(name, OBSERVATION, ACTION)
-
-
 def test_nested_observations_keep_their_keys() -> None:
     space = DictSpace(spaces={"map": BOARD, "unit": DictSpace(spaces={"hp": Discrete(n=5)})})
     policy = Bot(f"{__name__}:hit_points", space, ACTION)
@@ -91,6 +66,25 @@ def hit_points(observation: dict) -> int:
     return observation["unit"]["hp"]
 
 
-def test_dictionary_actions_are_not_supported() -> None:
+def test_functions_act_row_by_row_or_on_batches() -> None:
+    for name in ("first", "all_at_once"):
+        assert bot(name).act(BATCH).actions.tolist() == [1, 0]
+    both = bot("sampled").act(BATCH, rng=generators()).actions
+    second = {name: array[1:] for name, array in BATCH.items()}
+    assert bot("sampled").act(second, rng=generators()[1:]).actions.tolist() == [both[1]], "by its own generator"
+    faults = bot("text").act(BATCH).faults
+    assert all(isinstance(fault, MalformedAction) for fault in faults.values())
+    assert "returned str 'left': expected int64" in str(faults[1])
+
+
+def test_what_is_not_a_bot_is_rejected() -> None:
+    for name, message in (
+        (f"{MODULE}:missing", "bots.py\\) has no 'missing'"),
+        (f"{MODULE}:NOT_A_BOT", "is a int: expected a function, or a class with a method `act`"),
+        (f"{MODULE}:needs_more", "requires 'depth': expected the arguments observation, action_mask and rng"),
+        ("no_such_module:act", "cannot import 'no_such_module': .*; searched: "),
+    ):
+        with pytest.raises(ConfigError, match=f"script:{name}.*{message}"):
+            script(name, OBSERVATION, ACTION)
     with pytest.raises(EnvironmentMismatch, match="dict actions"):
         Bot(f"{MODULE}:first", OBSERVATION, DictSpace(spaces={"a": ACTION}))

@@ -5,6 +5,7 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,6 +18,8 @@ from league.spaces import Box, DictSpace, Discrete
 from tests.support.policies.graphs import continuous, counting, masked_mlp
 
 GRAPH = masked_mlp()
+
+
 POLICY = OnnxPolicy(GRAPH)
 
 
@@ -60,13 +63,6 @@ def test_greedy_actions_are_the_mode_of_the_legal_actions() -> None:
     assert answer.actions.tolist() == np.where(batch["action_mask"] == 1, logits, -np.inf).argmax(1).tolist()
     assert (answer.state, answer.dist_inputs) == (None, None)
     assert len(set(answer.actions.tolist())) > 3
-
-
-def test_a_graph_can_be_a_path_or_bytes(tmp_path: Path) -> None:
-    (tmp_path / "shared.onnx").write_bytes(GRAPH)
-    batch = observations(9)
-    for graph in (tmp_path / "shared.onnx", str(tmp_path / "shared.onnx")):
-        assert OnnxPolicy(graph, manifest()).act(batch).actions.tolist() == POLICY.act(batch).actions.tolist()
 
 
 def test_actions_do_not_depend_on_the_batch() -> None:
@@ -129,22 +125,6 @@ def test_recurrent_state_is_passed_in_and_returned() -> None:
     assert explored.dist_inputs is not None
 
 
-def test_an_observation_without_a_mask_may_be_passed_alone() -> None:
-    policy, batch = OnnxPolicy(continuous()), np.ones((3, 2), np.float32)
-    expected = policy.act({"observation": batch})
-    assert policy.act(batch).actions.tolist() == expected.actions.tolist()
-    with pytest.raises(ObservationError, match="action_mask is missing"):
-        POLICY.act(observations(3)["observation"])
-
-
-def test_exploring_vectors_requires_a_manifest() -> None:
-    policy = OnnxPolicy(continuous())
-    value = np.array([[0.25, -1.5]], np.float32)
-    assert (policy.act({"observation": value}).actions == value).all()
-    with pytest.raises(EnvironmentMismatch, match="cannot explore without a manifest"):
-        policy.act({"observation": value}, explore=True, rng=generators(1))
-
-
 def test_sampled_vectors_are_within_their_bounds() -> None:
     """Means and log standard deviations are both the observation, here 0.2 and -0.5."""
     rows = 4000
@@ -174,66 +154,61 @@ def test_sampled_vectors_are_within_their_bounds() -> None:
     assert (alone.actions[0] == answer.actions[7]).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"action_mask": None}, r"action_mask is missing: expected a batch of int8 \[7\]"),
-        ({"observation": np.zeros((1, 6, 7, 2))}, r"observation is float64 \[6, 7, 2\]: expected .* int8"),
-        ({"observation": np.zeros((1, 6, 7), np.int8)}, r"observation is int8 \[6, 7\]: expected .*\[6, 7, 2\]"),
-        ({"observation": np.zeros((2, 6, 7, 2), np.int8)}, r"rows differ: .*'observation': 2"),
-        ({"observation": [[0]]}, r"observation is not a NumPy array"),
-    ],
-)
-def test_an_observation_that_does_not_fit_is_rejected(change: dict[str, Any], message: str) -> None:
-    batch = {name: array for name, array in (observations(1) | change).items() if array is not None}
-    with pytest.raises(ObservationError, match=message):
-        POLICY.act(batch)
+def test_vectors_may_be_passed_alone_and_explore_only_with_a_manifest() -> None:
+    policy, value = OnnxPolicy(continuous()), np.array([[0.25, -1.5]], np.float32)
+    assert (policy.act({"observation": value}).actions == value).all()
+    assert (policy.act(value).actions == value).all()
+    with pytest.raises(EnvironmentMismatch, match="cannot explore without a manifest"):
+        policy.act({"observation": value}, explore=True, rng=generators(1))
 
 
-def test_a_state_that_does_not_fit_is_rejected() -> None:
-    policy = OnnxPolicy(counting())
-    batch = {"observation": np.zeros((1, 1), np.float32)}
-    with pytest.raises(ObservationError, match=r"state_in_0 is float32 \[2\]"):
-        policy.act(batch, state={"state_in_0": np.zeros((1, 2), np.float32)})
-    with pytest.raises(ObservationError, match=r"state_in_0 is missing"):
-        policy.act(batch, state={})
-
-
-@pytest.mark.parametrize("rng", [None, generators(1)])
-def test_exploring_needs_a_generator_for_each_row(rng: list[np.random.Generator] | None) -> None:
-    with pytest.raises(InvalidInput, match="2 rows needs rng"):
-        POLICY.act(observations(2), explore=True, rng=rng)
-
-
-@pytest.mark.parametrize(
-    ("graph", "changes", "message"),
-    [
-        (b"no graph", {}, "ONNX Runtime cannot load the graph"),
-        (GRAPH[:-100], {}, "ONNX Runtime cannot load the graph"),
-        (GRAPH, {"inputs": manifest().inputs[:1]}, "input action_mask of the graph is int8, but missing in"),
-        (counting(), {}, "input action_mask of the graph is missing, but int8 in the manifest"),
+def test_an_observation_that_does_not_fit_is_rejected(subtests: pytest.Subtests) -> None:
+    batch, recurrent = observations(1), {"observation": np.zeros((1, 1), np.float32)}
+    for act, message in (
+        (lambda: POLICY.act(batch["observation"]), r"action_mask is missing: expected a batch of int8 \[7\]"),
         (
-            GRAPH,
-            {"outputs": (Tensor(name="action", dtype="int32", shape=(None,)), manifest().outputs[1])},
-            "output action of the graph is int64, but int32 in the manifest",
+            lambda: POLICY.act(batch | {"observation": np.zeros((1, 6, 7, 2))}),
+            r"observation is float64 \[6, 7, 2\]: expected .* int8",
         ),
         (
-            GRAPH,
-            {"action": Discrete(n=8)},
-            "action_dist_inputs of the graph has 7 values per row, but its action space requires 8",
+            lambda: POLICY.act(batch | {"observation": np.zeros((1, 6, 7), np.int8)}),
+            r"observation is int8 \[6, 7\]: expected .*\[6, 7, 2\]",
         ),
-    ],
-)
-def test_a_graph_that_contradicts_its_manifest_is_rejected(graph: bytes, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ArtifactCorrupt, match=message) as caught:
-        OnnxPolicy(graph, manifest(**changes))
-    assert "\n" not in str(caught.value)
+        (
+            lambda: POLICY.act(batch | {"observation": np.zeros((2, 6, 7, 2), np.int8)}),
+            r"rows differ: .*'observation': 2",
+        ),
+        (lambda: POLICY.act(batch | {"observation": [[0]]}), r"observation is not a NumPy array"),
+        (
+            lambda: OnnxPolicy(counting()).act(recurrent, state={"state_in_0": np.zeros((1, 2), np.float32)}),
+            r"state_in_0 is float32 \[2\]",
+        ),
+        (lambda: OnnxPolicy(counting()).act(recurrent, state={}), r"state_in_0 is missing"),
+    ):
+        with subtests.test(message=message), pytest.raises(ObservationError, match=message):
+            act()
+    for rng in (None, generators(1)):
+        with pytest.raises(InvalidInput, match="2 rows needs rng"):
+            POLICY.act(observations(2), explore=True, rng=rng)
 
 
-def test_a_graph_needs_the_outputs_of_a_policy() -> None:
-    import onnx
-
+def test_a_graph_that_contradicts_its_manifest_is_rejected(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    (tmp_path / "shared.onnx").write_bytes(GRAPH)
+    batch, correct = observations(9), manifest()
+    for graph in (tmp_path / "shared.onnx", str(tmp_path / "shared.onnx")):
+        assert OnnxPolicy(graph, correct).act(batch).actions.tolist() == POLICY.act(batch).actions.tolist()
+    action = Tensor(name="action", dtype="int32", shape=(None,))
     model = onnx.load_from_string(GRAPH)
     del model.graph.output[1]
-    with pytest.raises(ArtifactCorrupt, match="has no output action_dist_inputs"):
-        OnnxPolicy(model.SerializeToString())
+    for graph, changes, message in (
+        (b"no graph", {}, "ONNX Runtime cannot load the graph"),
+        (GRAPH[:-100], {}, "ONNX Runtime cannot load the graph"),
+        (model.SerializeToString(), {}, "has no output action_dist_inputs"),
+        (GRAPH, {"inputs": correct.inputs[:1]}, "input action_mask of the graph is int8, but missing in"),
+        (counting(), {}, "input action_mask of the graph is missing, but int8 in the manifest"),
+        (GRAPH, {"outputs": (action, correct.outputs[1])}, "output action of the graph is int64, but int32 in the"),
+        (GRAPH, {"action": Discrete(n=8)}, "of the graph has 7 values per row, but its action space requires 8"),
+    ):
+        with subtests.test(message=message), pytest.raises(ArtifactCorrupt, match=message) as caught:
+            OnnxPolicy(graph, manifest(**changes))
+        assert "\n" not in str(caught.value)

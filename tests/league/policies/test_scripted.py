@@ -15,14 +15,7 @@ from league.policies.policy import Policy
 from league.policies.scripted import script
 from league.spaces import Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
 from league.spaces.conversion import to_gymnasium
-from tests.support.environments.line_games import (
-    GAMES,
-    environment_after,
-    legal,
-    observations,
-    random_moves,
-    spaces,
-)
+from tests.support.environments.line_games import GAMES, environment_after, legal, observations, random_moves, spaces
 from tests.support.examples import examples
 
 DRAWS = 150
@@ -95,35 +88,52 @@ def test_random_is_uniform_over_legal_actions() -> None:
     assert (np.abs(counts[[11, 12, 14]] - rows / 3) < 5 * np.sqrt(rows * 2 / 9)).all()
 
 
-@pytest.mark.parametrize(
-    ("action", "low", "high"),
-    [
-        (Discrete(n=4, start=-1), -1, 2),
-        (MultiDiscrete(nvec=[2, 3], start=[0, 5], shape=(2,)), [0, 5], [1, 7]),
-        (MultiBinary(shape=(3,)), 0, 1),
-        (Box(dtype="uint8", shape=(2,), low=3, high=5), 3, 5),
-    ],
-)
-def test_random_without_a_mask_covers_the_space(action: Space, low: Any, high: Any) -> None:
-    policy = script("random", Box(dtype="float32", shape=(1,), low=0, high=1), action)
-    actions = policy.act({"observation": np.zeros((2000, 1), np.float32)}, rng=generators(2000)).actions
-    assert not isinstance(action, DictSpace)
-    assert (actions.shape, actions.dtype) == ((2000, *action.shape), np.dtype(action.dtype))
-    assert (actions.min(axis=0) == low).all()
-    assert (actions.max(axis=0) == high).all()
-
-
-def test_random_covers_a_continuous_space() -> None:
-    action = Box(dtype="float32", shape=(2,), low=[-1.0, 0.0], high=[1.0, 10.0])
-    policy = script("random", Box(dtype="float32", shape=(1,), low=0, high=1), action)
-    actions = policy.act({"observation": np.zeros((5000, 1), np.float32)}, rng=generators(5000)).actions
-    assert actions.dtype == np.float32
-    assert (actions >= [-1, 0]).all()
-    assert (actions <= [1, 10]).all()
-    assert np.allclose(actions.mean(axis=0), [0, 5], atol=0.25)
-
-
 PAIR = MultiDiscrete(nvec=[2, 3], start=[0, 5], shape=(2,))
+
+
+def test_first_takes_the_lowest_legal_action() -> None:
+    for action, expected in (
+        (Discrete(n=3, start=2), 2),
+        (PAIR, [0, 5]),
+        (MultiBinary(shape=(2,)), [0, 0]),
+        (Box(dtype="float32", shape=(4,), low=[-2, 1, None, None], high=[5, 5, 5, -5]), [-2, 1, 0, -5]),
+    ):
+        actions = script("first", Discrete(n=4), action).act({"observation": np.zeros(3, np.int64)}).actions
+        assert actions.tolist() == [expected] * 3
+        assert all(to_gymnasium(action).contains(row) for row in actions)
+    mask = np.array([[0, 1, 1, 0, 1], [1, 0, 0, 1, 1]], np.int8)
+    batch = {"observation": mask, "action_mask": mask}
+    assert script("first", *masked(5, start=10)).act(batch).actions.tolist() == [11, 10]
+    assert script("first", masked(5)[0], PAIR).act(batch).actions.tolist() == [[1, 5], [0, 6]]
+    with pytest.raises(IllegalMask, match="allows no action"):
+        script("first", *masked(5)).act(batch | {"action_mask": mask * 0})
+
+
+def test_unknown_scripts_and_unsupported_spaces_are_rejected(subtests: pytest.Subtests) -> None:
+    with pytest.raises(UnknownPolicy, match=r"unknown script 'minimax'; known: random, one_ply, .*, solver"):
+        script("minimax", *masked(3))
+    board, three = spaces(tictactoe())[0], Discrete(n=3)
+    for name, observation, action in (
+        ("one_ply", *masked(7)),
+        ("one_ply", Box(dtype="int8", shape=(6, 7, 2), low=0, high=1), Discrete(n=7)),
+        ("one_ply", board, Discrete(n=8)),
+        ("mcts_100", *masked(7)),
+        ("solver", board, Discrete(n=8)),
+        ("random", masked(5)[0], MultiDiscrete(nvec=[2, 2], start=[0, 0], shape=(2,))),
+        ("random", masked(4)[0], Box(dtype="float32", shape=(4,), low=0, high=1)),
+        ("first", masked(4)[0], Discrete(n=5)),
+        ("first", three, DictSpace(spaces={"move": Discrete(n=2)})),
+        ("mirror", three, three),
+        ("mirror", Box(dtype="int8", shape=(4,), low=0, high=1), three),
+        ("random", three, Box(dtype="float32", shape=(1,), low=None, high=1)),
+        ("random", three, DictSpace(spaces={"move": Discrete(n=2)})),
+    ):
+        with subtests.test(name=name), pytest.raises(EnvironmentMismatch, match=f"script:{name}"):
+            script(name, observation, action)
+    # The games of OpenSpiel with the same names have other observations.
+    message = "script:solver needs the spaces of PettingZoo's connect_four_v3 or tictactoe_v3"
+    with pytest.raises(EnvironmentMismatch, match=message):
+        script("solver", Box(dtype="float32", shape=(27,), low=0, high=1), Discrete(n=9))
 
 
 def test_random_applies_the_mask_of_each_element() -> None:
@@ -137,31 +147,6 @@ def test_random_applies_the_mask_of_each_element() -> None:
     mask[3, 2:] = 0
     with pytest.raises(IllegalMask, match="allows no action"):
         policy.act({"observation": mask, "action_mask": mask}, rng=generators(rows))
-
-
-@pytest.mark.parametrize(
-    ("action", "expected"),
-    [
-        (Discrete(n=3, start=2), 2),
-        (PAIR, [0, 5]),
-        (MultiBinary(shape=(2,)), [0, 0]),
-        (Box(dtype="float32", shape=(4,), low=[-2, 1, None, None], high=[5, 5, 5, -5]), [-2, 1, 0, -5]),
-    ],
-)
-def test_first_takes_the_lowest_action(action: Space, expected: Any) -> None:
-    policy = script("first", Discrete(n=4), action)
-    actions = policy.act({"observation": np.zeros(3, np.int64)}).actions
-    assert actions.tolist() == [expected] * 3
-    assert all(to_gymnasium(action).contains(row) for row in actions)
-
-
-def test_first_takes_the_first_legal_action() -> None:
-    mask = np.array([[0, 1, 1, 0, 1], [1, 0, 0, 1, 1]], np.int8)
-    batch = {"observation": mask, "action_mask": mask}
-    assert script("first", *masked(5, start=10)).act(batch).actions.tolist() == [11, 10]
-    assert script("first", masked(5)[0], PAIR).act(batch).actions.tolist() == [[1, 5], [0, 6]]
-    with pytest.raises(IllegalMask, match="allows no action"):
-        script("first", *masked(5)).act(batch | {"action_mask": mask * 0})
 
 
 def test_mirror_repeats_the_last_move_of_the_opponent() -> None:
@@ -179,41 +164,6 @@ def test_mirror_repeats_the_last_move_of_the_opponent() -> None:
     assert answers == [0, *moves[:-1]]
 
 
-def test_unknown_scripts_are_reported_with_the_known_ones() -> None:
-    with pytest.raises(UnknownPolicy, match=r"unknown script 'minimax'; known: random, one_ply, .*, solver"):
-        script("minimax", *masked(3))
-
-
-@pytest.mark.parametrize(
-    ("name", "observation", "action"),
-    [
-        ("one_ply", *masked(7)),
-        ("one_ply", Box(dtype="int8", shape=(6, 7, 2), low=0, high=1), Discrete(n=7)),
-        ("one_ply", spaces(tictactoe())[0], Discrete(n=8)),
-        ("mcts_100", *masked(7)),
-        ("solver", spaces(tictactoe())[0], Discrete(n=8)),
-        ("random", masked(5)[0], MultiDiscrete(nvec=[2, 2], start=[0, 0], shape=(2,))),
-        ("random", masked(4)[0], Box(dtype="float32", shape=(4,), low=0, high=1)),
-        ("first", masked(4)[0], Discrete(n=5)),
-        ("first", Discrete(n=3), DictSpace(spaces={"move": Discrete(n=2)})),
-        ("mirror", Discrete(n=3), Discrete(n=3)),
-        ("mirror", Box(dtype="int8", shape=(4,), low=0, high=1), Discrete(n=3)),
-        ("random", Discrete(n=3), Box(dtype="float32", shape=(1,), low=None, high=1)),
-        ("random", Discrete(n=3), DictSpace(spaces={"move": Discrete(n=2)})),
-    ],
-)
-def test_unsupported_spaces_are_rejected(name: str, observation: Space, action: Space) -> None:
-    with pytest.raises(EnvironmentMismatch, match=f"script:{name}"):
-        script(name, observation, action)
-
-
-def test_scripts_of_line_games_name_the_environments_that_they_play() -> None:
-    """The games of OpenSpiel with the same names have other observations."""
-    message = "script:solver needs the spaces of PettingZoo's connect_four_v3 or tictactoe_v3"
-    with pytest.raises(EnvironmentMismatch, match=message):
-        script("solver", Box(dtype="float32", shape=(27,), low=0, high=1), Discrete(n=9))
-
-
 @pytest.mark.parametrize("name", ["random", "one_ply", "mcts_100", "solver"])
 def test_missing_generators_and_empty_masks_are_reported(name: str) -> None:
     policy = script(name, *spaces(tictactoe()))
@@ -225,3 +175,22 @@ def test_missing_generators_and_empty_masks_are_reported(name: str) -> None:
     nothing: Mapping[str, np.ndarray] = batch | {"action_mask": np.zeros((2, 9), np.int8)}
     with pytest.raises(IllegalMask, match="allows no action"):
         policy.act(nothing, rng=generators(2))
+
+
+def test_random_without_a_mask_covers_the_space(subtests: pytest.Subtests) -> None:
+    for action, low, high in (
+        (Discrete(n=4, start=-1), -1, 2),
+        (PAIR, [0, 5], [1, 7]),
+        (MultiBinary(shape=(3,)), 0, 1),
+        (Box(dtype="uint8", shape=(2,), low=3, high=5), 3, 5),
+        (Box(dtype="float32", shape=(2,), low=[-1.0, 0.0], high=[1.0, 10.0]), [-1, 0], [1, 10]),
+    ):
+        with subtests.test(action=str(action)):
+            policy = script("random", Box(dtype="float32", shape=(1,), low=0, high=1), action)
+            actions = policy.act({"observation": np.zeros((5000, 1), np.float32)}, rng=generators(5000)).actions
+            assert (actions.shape, actions.dtype) == ((5000, *action.shape), np.dtype(action.dtype))
+            tolerance = 0.01 if action.dtype == "float32" else 0
+            np.testing.assert_allclose(actions.min(axis=0), low, atol=tolerance)
+            np.testing.assert_allclose(actions.max(axis=0), high, atol=tolerance)
+            assert all(to_gymnasium(action).contains(row) for row in actions)
+            np.testing.assert_allclose(actions.mean(axis=0), np.add(low, high) / 2, atol=0.25)

@@ -2,11 +2,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from league.random import pcg64
+from league.random.pcg64 import generate_state
 
 SEEDS = np.concatenate([np.arange(1000), np.random.default_rng(0).integers(2**31, size=2000), [2**31 - 1, 2**32 - 1]])
 
@@ -30,35 +30,38 @@ def test_outputs_of_a_seed_do_not_depend_on_the_others(seeds: list[int], count: 
     assert found.T.tolist() == [array.tolist() for array in expected]
 
 
-@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-0.9, 0.9), (0.3, 7.7)])
-def test_uniform_draws_equal_those_of_numpy(low: float, high: float) -> None:
-    expected = with_numpy(lambda rng: rng.uniform(low, high, 6))
-    np.testing.assert_array_equal(pcg64.uniform(pcg64.outputs(SEEDS, 6), low, high), expected)
+words = st.integers(0, 2**32 - 1)
 
 
-@pytest.mark.parametrize("high", [2, 3, 4, 5, 1000, 2**31])
-def test_integers_equal_those_of_numpy(high: int) -> None:
-    expected = with_numpy(lambda rng: [rng.integers(high), rng.integers(high)])
+@given(st.lists(st.tuples(st.integers(0, 2**63 - 1), words, words), max_size=5), words)
+def test_each_seed_may_have_its_own_spawn_key(rows: list[tuple[int, int, int]], common: int) -> None:
+    seeds, first, second = np.array(rows, dtype=np.int64).reshape(-1, 3).T
+    expected = [
+        np.random.SeedSequence(seed, spawn_key=(a, common, b)).generate_state(4, np.uint64).tolist()
+        for seed, a, b in rows
+    ]
+    assert generate_state(seeds, [first, common, second]).T.tolist() == expected
+
+
+def test_draws_equal_those_of_numpy() -> None:
+    for low, high in ((-1.0, 1.0), (-0.9, 0.9), (0.3, 7.7)):
+        expected = with_numpy(lambda rng, low=low, high=high: rng.uniform(low, high, 6))
+        np.testing.assert_array_equal(pcg64.uniform(pcg64.outputs(SEEDS, 6), low, high), expected)
     (output,) = pcg64.outputs(SEEDS, 1)
-    found, accepted = pcg64.integers(np.stack([output, output >> 32]), high)
-    assert accepted.all()
-    np.testing.assert_array_equal(found, expected)
+    for most in (2, 3, 4, 5, 1000, 2**31):
+        drawn, accepted = pcg64.integers(np.stack([output, output >> 32]), most)
+        assert accepted.all()
+        np.testing.assert_array_equal(drawn, with_numpy(lambda rng, most=most: [rng.integers(most) for _ in range(2)]))
 
 
 def test_integers_that_numpy_draws_again_are_not_accepted() -> None:
-    high = 2**31 + 1
     (output,) = pcg64.outputs(SEEDS, 1)
-    found, accepted = pcg64.integers(output, high)
+    drawn, accepted = pcg64.integers(output, 2**31 + 1)
     assert 0.4 < accepted.mean() < 0.6
-
-    values = with_numpy(lambda rng: rng.integers(high))
-    np.testing.assert_array_equal(found[accepted], values[accepted])
-    assert (found[~accepted] != values[~accepted]).all()
-
-
-def test_the_smallest_product_is_not_accepted() -> None:
-    """Lemire's method rejects 2³² mod 3 = 1 of the 32-bit outputs, which is 0."""
-    halves = np.array([0, 1, 2**32 - 1], dtype=np.uint64)
-    found, accepted = pcg64.integers(halves, 3)
+    values = with_numpy(lambda rng: rng.integers(2**31 + 1))
+    np.testing.assert_array_equal(drawn[accepted], values[accepted])
+    assert (drawn[~accepted] != values[~accepted]).all()
+    # Lemire's method rejects 2³² mod 3 = 1 of the 32-bit outputs, which is 0.
+    drawn, accepted = pcg64.integers(np.array([0, 1, 2**32 - 1], dtype=np.uint64), 3)
     assert accepted.tolist() == [False, True, True]
-    assert found.tolist() == [0, 0, 2]
+    assert drawn.tolist() == [0, 0, 2]

@@ -1,5 +1,4 @@
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -20,11 +19,3 @@ def empty(storage: Storage) -> Iterator[Registry]:
 def registry(empty: Registry) -> Registry:
     """A registry with one league and no versions."""
     return registered(empty)
-
-
-@pytest.fixture
-def local(tmp_path: Path) -> Iterator[Registry]:
-    """A registry on SQLite with one league, for tests that do not depend on the database."""
-    registry = Registry.open(Storage.at(tmp_path / "home"))
-    yield registered(registry)
-    registry.close()

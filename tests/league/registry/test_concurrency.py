@@ -10,7 +10,11 @@ import pytest
 from league.errors import AliasMoved
 from league.registry.registry import Registry
 from league.settings import Storage
+from tests.support.databases import on_both_databases
 from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered
+
+pytestmark = on_both_databases
+
 
 PROCESSES = 3
 
@@ -55,27 +59,6 @@ def test_processes_that_open_a_new_home_together_agree(processes: ProcessPoolExe
     assert list(processes.map(_open, [storage] * PROCESSES * 2)) == [1] * PROCESSES * 2
 
 
-def test_publishers_never_share_a_number(processes: ProcessPoolExecutor, registry: Registry, storage: Storage) -> None:
-    sources = [[f"run-{process}/{i}" for i in range(6)] for process in range(PROCESSES)]
-    numbers = list(processes.map(_publish, [storage] * PROCESSES, sources))
-    given = dict(zip(chain(*numbers), chain(*sources), strict=True))
-    assert sorted(given) == list(range(1, 6 * PROCESSES + 1))
-    published = {version.number: version.source for version in registry.versions.all(LEAGUE)}
-    assert published == given
-    for number in published:
-        registry.versions.fetch(LEAGUE, number)
-
-
-def test_publishers_of_the_same_checkpoints_publish_each_once(
-    processes: ProcessPoolExecutor, registry: Registry, storage: Storage
-) -> None:
-    sources = [f"run/{i}" for i in range(6)]
-    numbers = list(processes.map(_publish, [storage] * PROCESSES, [sources] * PROCESSES))
-    assert numbers == [numbers[0]] * PROCESSES
-    assert [version.source for version in registry.versions.all(LEAGUE)] == sources
-    assert leftovers(registry) == []
-
-
 def test_each_compare_and_set_has_one_winner(
     processes: ProcessPoolExecutor, registry: Registry, storage: Storage
 ) -> None:
@@ -87,3 +70,20 @@ def test_each_compare_and_set_has_one_winner(
     assert [sum(event.actor == actor for event in history) for actor in actors] == won
     assert [event.previous for event in history] == [None, *(event.version for event in history[:-1])]
     assert registry.aliases.current(LEAGUE) == {"champion": history[-1].version}
+
+
+def test_publishers_share_no_number_and_publish_each_checkpoint_once(
+    processes: ProcessPoolExecutor, registry: Registry, storage: Storage
+) -> None:
+    sources = [[f"run-{process}/{i}" for i in range(6)] for process in range(PROCESSES)]
+    numbers = list(processes.map(_publish, [storage] * PROCESSES, sources))
+    published = {version.number: version.source for version in registry.versions.all(LEAGUE)}
+    assert published == dict(zip(chain(*numbers), chain(*sources), strict=True))
+    assert sorted(published) == list(range(1, 6 * PROCESSES + 1))
+    for number in published:
+        registry.versions.fetch(LEAGUE, number)
+    same = [f"run/{i}" for i in range(6)]
+    numbers = list(processes.map(_publish, [storage] * PROCESSES, [same] * PROCESSES))
+    assert numbers == [numbers[0]] * PROCESSES
+    assert [version.source for version in registry.versions.all(LEAGUE)][len(published) :] == same
+    assert leftovers(registry) == []

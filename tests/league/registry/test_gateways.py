@@ -12,10 +12,12 @@ from league.registry.registry import Registry
 from tests.support.leagues.registries import LEAGUE
 
 TRAINING = Gateway("http://127.0.0.1:4001", "a", LEAGUE, "training", simulators=2)
+
+
 EVALUATION = Gateway("http://127.0.0.1:4002", "b", LEAGUE, "evaluation", simulators=2, waiting=7)
 
 
-def test_gateways_are_found_until_they_close(registry: Registry) -> None:
+def test_gateways_are_found_until_they_close(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     for gateway in (TRAINING, EVALUATION):
         registry.gateways.announce(gateway)
     assert registry.gateways.open(LEAGUE) == [EVALUATION, TRAINING], "an evaluation comes first"
@@ -25,14 +27,7 @@ def test_gateways_are_found_until_they_close(registry: Registry) -> None:
     assert registry.gateways.open("another") == []
     registry.gateways.close(EVALUATION)
     assert registry.gateways.open(LEAGUE) == [lonely]
-
-
-def test_a_gateway_whose_process_has_died_is_forgotten(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    registry.gateways.announce(TRAINING)
-    monkeypatch.setattr(gateways, "SILENCE", timedelta(0))
-    assert registry.gateways.open(LEAGUE) == []
-
-
-def test_a_gateway_needs_a_league(registry: Registry) -> None:
     with pytest.raises(UnknownLeague):
         registry.gateways.announce(replace(TRAINING, league="another"))
+    monkeypatch.setattr(gateways, "SILENCE", timedelta(0))
+    assert registry.gateways.open(LEAGUE) == [], "its process has died"

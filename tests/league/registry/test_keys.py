@@ -23,23 +23,6 @@ def test_a_token_is_returned_once_and_stored_as_a_digest(registry: Registry) -> 
         assert token[-64:] not in str(connection.execute(text("SELECT * FROM api_keys")).all())
 
 
-def test_tokens_are_unique(registry: Registry) -> None:
-    tokens = {registry.keys.create(f"bot-{i}", SCOPES)[1] for i in range(20)}
-    assert len(tokens) == 20
-    assert [key.name for key in registry.keys.all()] == [f"bot-{i}" for i in range(20)]
-
-
-def test_a_revoked_key_is_invalid_and_its_name_is_not_reused(registry: Registry) -> None:
-    key, _ = registry.keys.create("bot", ["act"])
-    assert key.is_valid(datetime.now(UTC))
-    revoked = registry.keys.revoke("bot")
-    assert not revoked.is_valid(datetime.now(UTC))
-    assert registry.keys.revoke(key.id) == revoked, "revoking twice has no effect"
-    assert registry.keys.all() == [revoked]
-    with pytest.raises(NameTaken, match="'bot'"):
-        registry.keys.create("bot", ["act"])
-
-
 def test_a_key_is_not_valid_for_another_league_of_the_same_name(registry: Registry) -> None:
     registered(registry, "kept")
     registry.keys.create("only", ["act"], only_leagues=[LEAGUE])
@@ -58,19 +41,6 @@ def test_a_key_is_not_valid_for_another_league_of_the_same_name(registry: Regist
     assert registry.changes.counts().keys > counts.keys, "replicas read the keys again"
 
 
-def test_a_name_has_precedence_over_an_id(registry: Registry) -> None:
-    first, _ = registry.keys.create("bot", ["act"])
-    registry.keys.create(first.id, ["act"])
-    assert registry.keys.revoke(first.id).name == first.id
-
-
-def test_a_key_expires(registry: Registry) -> None:
-    expires = datetime.now(UTC) + timedelta(days=1)
-    key, _ = registry.keys.create("bot", ["act"], expires_at=expires)
-    assert key.is_valid(expires - timedelta(seconds=1))
-    assert not key.is_valid(expires)
-
-
 def test_invalid_keys_are_rejected(registry: Registry) -> None:
     with pytest.raises(InvalidReference, match="'A B'"):
         registry.keys.create("A B", ["act"])
@@ -86,3 +56,21 @@ def test_invalid_keys_are_rejected(registry: Registry) -> None:
     assert registry.keys.all() == []
     with pytest.raises(UnknownKey, match="'bot'; known: none yet"):
         registry.keys.revoke("bot")
+
+
+def test_a_key_is_valid_until_it_expires_or_is_revoked(registry: Registry) -> None:
+    expires = datetime.now(UTC) + timedelta(days=1)
+    key, _ = registry.keys.create("bot", ["act"], expires_at=expires)
+    assert key.is_valid(expires - timedelta(seconds=1))
+    assert not key.is_valid(expires)
+    revoked = registry.keys.revoke("bot")
+    assert not revoked.is_valid(datetime.now(UTC))
+    assert registry.keys.revoke(key.id) == revoked, "revoking twice has no effect"
+    assert registry.keys.all() == [revoked]
+    with pytest.raises(NameTaken, match="'bot'"):
+        registry.keys.create("bot", ["act"])
+    registry.keys.create(key.id, ["act"])
+    assert registry.keys.revoke(key.id).name == key.id, "a name has precedence over an id"
+    tokens = {registry.keys.create(f"bot-{i}", SCOPES)[1] for i in range(20)}
+    assert len(tokens) == 20
+    assert [row.name for row in registry.keys.all()][2:] == [f"bot-{i}" for i in range(20)]

@@ -1,5 +1,3 @@
-import logging
-
 import pytest
 
 from league.config.environment import EnvironmentConfig
@@ -13,39 +11,62 @@ from tests.support.leagues.ledger_matches import SCHEDULE, play_match
 from tests.support.leagues.registries import LEAGUE, config, interface, publish, registered
 
 
-def test_a_league_is_stored_as_registered(registry: Registry) -> None:
-    row = registry.leagues.get(LEAGUE)
-    assert row.config == config()
-    assert row.interface == interface()
-    assert row.interface_digest == interface().digest()
-    assert row.environment_digest == config().environment.digest()
-    assert row.game_digest == config().game_digest()
-
-
-def test_leagues_are_listed_by_name(registry: Registry) -> None:
-    registered(registry, "another")
-    assert list(registry.leagues.names()) == ["another", LEAGUE]
-
-
 def test_registering_again_updates_the_configuration_and_keeps_the_versions(registry: Registry) -> None:
+    registry.leagues.register(config(), interface(squares=4))
+    registry.leagues.register(config(), interface())
     before = registry.leagues.get(LEAGUE)
     version = publish(registry, "run/1")
+    with pytest.raises(InterfaceChanged, match=LEAGUE):
+        registry.leagues.register(config(), interface(squares=4))
     registry.leagues.register(config(kwargs={"screen_height": 500}), interface())
     after = registry.leagues.get(LEAGUE)
     assert after.config.environment.kwargs == {"screen_height": 500}
     assert after.environment_digest != before.environment_digest
-    assert after.registered_at == before.registered_at
+    assert (after.registered_at, after.interface) == (before.registered_at, interface())
     assert registry.versions.all(LEAGUE) == [version]
-    assert publish(registry, "run/2").number == 2
 
 
-def test_an_interface_can_change_only_without_versions(registry: Registry) -> None:
-    registry.leagues.register(config(), interface(squares=4))
-    registry.leagues.register(config(), interface())
+def with_play(**play: object) -> LeagueConfig:
+    return LeagueConfig.from_mapping(config().model_dump(by_alias=True) | {"play": play})
+
+
+def test_a_change_of_the_game_is_reported_once_it_concerns_results(
+    registry: Registry, caplog: pytest.LogCaptureFixture
+) -> None:
+    for play in ({"opening_plies": 4}, {"actions": "sampled"}, {}):
+        registry.leagues.register(with_play(**play), interface())
+    ledger = Ledger(registry)
+    ledger.open(SCHEDULE)
+    ledger.append(play_match(SCHEDULE, 0))
+    for play in ({}, {"actions": "greedy"}):  # the default
+        registry.leagues.register(with_play(**play), interface())
+    assert caplog.messages == []
+    for play in ({"opening_plies": 4}, {"actions": "sampled"}, {"opening_plies": 4}):
+        registry.leagues.register(with_play(**play), interface())
+    game, _, back = caplog.messages
+    assert "the game has changed: play.opening_plies 0 → 4. Earlier results can be viewed" in game
+    assert "opening_plies 0 → 4; how versions select actions has changed: sampled → greedy. Earlier" in back
+    row = registry.leagues.get(LEAGUE)
+    assert ledger.counted(LEAGUE, row.conditions) == []
+    assert ledger.counted(LEAGUE, SCHEDULE.conditions) == [SCHEDULE]
+    assert row.environment_digest == SCHEDULE.environment_digest
+    registry.leagues.register(with_play(), interface())
+    registry.leagues.register(with_play(actions="sampled"), interface())
+    assert "how versions select actions has changed: greedy → sampled. Earlier results can be" in caplog.messages[-1]
+
+
+def test_a_league_follows_the_code_of_its_environment(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = registry.leagues.get(LEAGUE)
+    assert registry.leagues.follow_code(LEAGUE, described) == before
     publish(registry, "run/1")
-    with pytest.raises(InterfaceChanged, match=LEAGUE):
-        registry.leagues.register(config(), interface(squares=4))
-    assert registry.leagues.get(LEAGUE).interface == interface()
+    changed = config(revision="2").game()
+    monkeypatch.setattr(LeagueConfig, "game", lambda self: changed)
+    with pytest.raises(InterfaceChanged):
+        registry.leagues.follow_code(LEAGUE, lambda config: interface(squares=10))
+    assert registry.leagues.get(LEAGUE).game_digest == before.game_digest
+    after = registry.leagues.follow_code(LEAGUE, described)
+    assert after.game_digest == config().game_digest() != before.game_digest
+    assert after.config == before.config
 
 
 def test_an_unknown_league_is_reported_with_the_known_ones(empty: Registry) -> None:
@@ -54,49 +75,6 @@ def test_an_unknown_league_is_reported_with_the_known_ones(empty: Registry) -> N
     registered(empty)
     with pytest.raises(UnknownLeague, match=f"no league 'chess'; known: {LEAGUE}"):
         empty.versions.all("chess")
-
-
-def test_a_change_of_the_game_is_reported_once_it_concerns_results(
-    registry: Registry, caplog: pytest.LogCaptureFixture
-) -> None:
-    other = LeagueConfig.from_mapping(config().model_dump(by_alias=True) | {"play": {"opening_plies": 4}})
-    with caplog.at_level(logging.WARNING):
-        registry.leagues.register(other, interface())
-        registry.leagues.register(config(), interface())
-        assert caplog.messages == []
-        ledger = Ledger(registry)
-        ledger.open(SCHEDULE)
-        ledger.append(play_match(SCHEDULE, 0))
-        registry.leagues.register(config(), interface())
-        assert caplog.messages == []
-        registry.leagues.register(other, interface())
-    assert len(caplog.messages) == 1
-    assert "the game has changed: play.opening_plies 0 → 4. Earlier results can be viewed" in caplog.messages[0]
-    row = registry.leagues.get(LEAGUE)
-    assert ledger.counted(LEAGUE, row.conditions) == []
-    assert ledger.counted(LEAGUE, SCHEDULE.conditions) == [SCHEDULE]
-    assert row.environment_digest == SCHEDULE.environment_digest
-
-
-def test_a_change_of_the_action_selection_is_reported_once_it_concerns_results(
-    registry: Registry, caplog: pytest.LogCaptureFixture
-) -> None:
-    def with_play(**play: object) -> LeagueConfig:
-        return LeagueConfig.from_mapping(config().model_dump(by_alias=True) | {"play": play})
-
-    with caplog.at_level(logging.WARNING):
-        registry.leagues.register(with_play(actions="sampled"), interface())
-        registry.leagues.register(config(), interface())
-        ledger = Ledger(registry)
-        ledger.open(SCHEDULE)
-        ledger.append(play_match(SCHEDULE, 0))
-        registry.leagues.register(with_play(actions="greedy"), interface())
-        assert caplog.messages == [], "greedy is the default"
-        registry.leagues.register(with_play(actions="sampled"), interface())
-        registry.leagues.register(with_play(opening_plies=4), interface())
-    first, second = caplog.messages
-    assert "how versions select actions has changed: greedy → sampled. Earlier results can be viewed" in first
-    assert "opening_plies 0 → 4; how versions select actions has changed: sampled → greedy. Earlier" in second
 
 
 def test_results_count_again_when_the_game_is_back(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:
@@ -142,26 +120,6 @@ def described(_: LeagueConfig) -> Interface:
     return interface()
 
 
-def test_a_league_follows_the_code_of_its_environment(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = registry.leagues.get(LEAGUE)
-    assert registry.leagues.follow_code(LEAGUE, described) == before
-    changed = config(revision="2").game()
-    monkeypatch.setattr(LeagueConfig, "game", lambda self: changed)
-    after = registry.leagues.follow_code(LEAGUE, described)
-    assert after.game_digest == config().game_digest() != before.game_digest
-    assert after.config == before.config
-
-
-def test_code_with_other_spaces_is_not_followed(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    publish(registry, "run/1")
-    before = registry.leagues.get(LEAGUE)
-    changed = config(revision="2").game()
-    monkeypatch.setattr(LeagueConfig, "game", lambda self: changed)
-    with pytest.raises(InterfaceChanged):
-        registry.leagues.follow_code(LEAGUE, lambda config: interface(squares=10))
-    assert registry.leagues.get(LEAGUE) == before
-
-
 def test_nothing_is_registered_or_published_in_an_archived_league(registry: Registry) -> None:
     publish(registry, "run/1")
     archived = registry.leagues.archive(LEAGUE)
@@ -182,3 +140,11 @@ def test_a_new_league_is_not_named_like_an_option(registry: Registry) -> None:
     assert registry.leagues.names().keys() == {LEAGUE}
     with pytest.raises(InvalidReference, match="alias '-x' must not begin with '-'"):
         registry.aliases.set(LEAGUE, "-x", 1, expected=ANY, actor="test", reason="test")
+
+
+def test_a_league_is_stored_as_registered(registry: Registry) -> None:
+    registered(registry, "another")
+    assert list(registry.leagues.names()) == ["another", LEAGUE]
+    row = registry.leagues.get(LEAGUE)
+    assert (row.config, row.interface, row.interface_digest) == (config(), interface(), interface().digest())
+    assert (row.environment_digest, row.game_digest) == (config().environment.digest(), config().game_digest())

@@ -7,20 +7,14 @@ from pathlib import Path
 import pytest
 from sqlalchemy import update
 
-from league.errors import (
-    EnvironmentMismatch,
-    InvalidInput,
-    NotPromotable,
-    UnknownVersion,
-    VersionRetired,
-)
+from league.errors import EnvironmentMismatch, InvalidInput, NotPromotable, UnknownVersion, VersionRetired
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MIXTURE, TRAINING, Manifest
 from league.registry.storage.tables import VersionTable
 from league.results.ledger import Ledger
 from tests.support.leagues.ledger_matches import SCHEDULE
-from tests.support.leagues.registries import LEAGUE, builder, config, interface, publish, registered
+from tests.support.leagues.registries import LEAGUE, builder, config, publish, registered
 
 
 def promote(registry: Registry, version: int) -> None:
@@ -32,16 +26,29 @@ def test_a_mixture_is_a_version(registry: Registry) -> None:
     row = registry.publisher.publish_mixture(LEAGUE, {3: 0.4, 1: 0.6})
     assert (row.number, row.role, row.steps) == (4, MIXTURE, 3000)
     assert row.mixture is not None
-    assert [(each.version, each.probability) for each in row.mixture.members] == [(1, 0.6), (3, 0.4)]
-    assert [each.sha256 for each in row.mixture.members] == [registry.versions.get(LEAGUE, n).sha256 for n in (1, 3)]
+    assert [(member.version, member.probability) for member in row.mixture.members] == [(1, 0.6), (3, 0.4)]
+    digests = [registry.versions.get(LEAGUE, number).sha256 for number in (1, 3)]
+    assert [member.sha256 for member in row.mixture.members] == digests
     assert registry.artifacts.verify_names(LEAGUE, 4, row.sha256).mixture == row.mixture
+    assert registry.publisher.publish_mixture(LEAGUE, {1: 0.6, 3: 0.4}) == row, "equal mixtures are one version"
+    assert registry.publisher.publish_mixture(LEAGUE, {1: 0.5, 3: 0.5}).number == 5
 
 
-def test_equal_mixtures_are_one_version(registry: Registry) -> None:
+def test_unsuitable_members_are_rejected(registry: Registry, subtests: pytest.Subtests) -> None:
     registered(registry, versions=2)
-    first = registry.publisher.publish_mixture(LEAGUE, {1: 0.6, 2: 0.4})
-    assert registry.publisher.publish_mixture(LEAGUE, {2: 0.4, 1: 0.6}) == first
-    assert registry.publisher.publish_mixture(LEAGUE, {1: 0.5, 2: 0.5}).number == first.number + 1
+    registry.publisher.publish(LEAGUE, exploiter, source="exploiter")
+    registry.publisher.publish_mixture(LEAGUE, {1: 0.6, 2: 0.4})
+    registry.publisher.publish(LEAGUE, elsewhere, source="elsewhere")
+    for shares, error, message in (
+        ({1: 0.5, 9: 0.5}, UnknownVersion, "has no version 9; the newest is 5"),
+        ({1: 0.5, 2: 0.4}, InvalidInput, "sum to 0.9, expected 1"),
+        ({1: 0.5, 4: 0.5}, InvalidInput, r"tictactoe@4 is a mixture \(@1 60.0 %, @2 40.0 %\): name one"),
+        ({1: 0.5, 3: 0.5}, NotPromotable, "tictactoe@3 has the role exploiter"),
+        ({1: 0.5, 5: 0.5}, EnvironmentMismatch, "tictactoe@1 and tictactoe@5 were trained in different environments"),
+    ):
+        with subtests.test(shares=shares), pytest.raises(error, match=message):
+            registry.publisher.publish_mixture(LEAGUE, shares)
+    assert [row.number for row in registry.versions.all(LEAGUE)] == [1, 2, 3, 4, 5], "nothing was published"
 
 
 def test_history_and_rollback_treat_it_as_one(registry: Registry) -> None:
@@ -54,37 +61,12 @@ def test_history_and_rollback_treat_it_as_one(registry: Registry) -> None:
     assert [event.version for event in registry.aliases.history(LEAGUE)] == [1, 3, 2, 3, 1]
 
 
-@pytest.mark.parametrize(
-    ("shares", "error", "message"),
-    [
-        ({1: 0.5, 9: 0.5}, UnknownVersion, "has no version 9; the newest is 5"),
-        ({1: 0.5, 2: 0.4}, InvalidInput, "sum to 0.9, expected 1"),
-        ({1: 0.5, 4: 0.5}, InvalidInput, r"tictactoe@4 is a mixture \(@1 60.0 %, @2 40.0 %\): name one"),
-        ({1: 0.5, 3: 0.5}, NotPromotable, "tictactoe@3 has the role exploiter"),
-        ({1: 0.5, 5: 0.5}, EnvironmentMismatch, "tictactoe@1 and tictactoe@5 were trained in different environments"),
-    ],
-)
-def test_unsuitable_members_are_rejected(
-    registry: Registry, shares: dict[int, float], error: type[Exception], message: str
-) -> None:
+def test_members_of_another_interface_are_rejected(registry: Registry, tmp_path: Path) -> None:
     registered(registry, versions=2)
-    registry.publisher.publish(LEAGUE, exploiter, source="exploiter")
-    registry.publisher.publish_mixture(LEAGUE, {1: 0.6, 2: 0.4})
-    registry.publisher.publish(LEAGUE, elsewhere, source="elsewhere")
-    with pytest.raises(error, match=message):
-        registry.publisher.publish_mixture(LEAGUE, shares)
-    assert [row.number for row in registry.versions.all(LEAGUE)] == [1, 2, 3, 4, 5], "nothing was published"
-
-
-def test_members_of_another_interface_are_rejected(registry: Registry) -> None:
-    registered(registry, versions=2)
-    registry.leagues.register(config(), interface())
+    files = registry.versions.get(LEAGUE, 2).manifest.files
+    manifest = builder(squares=4)(tmp_path, 2).model_copy(update={"files": files})
     with registry.database.write() as session:
-        old = registry.versions.get(LEAGUE, 2).manifest
-        other = Manifest.from_json(
-            builder(squares=4)(directory_of(registry), 2).model_copy(update={"files": old.files}).to_json(), "test"
-        )
-        session.execute(update(VersionTable).filter_by(number=2).values(manifest=other.to_json()))
+        session.execute(update(VersionTable).filter_by(number=2).values(manifest=manifest.to_json()))
     with pytest.raises(EnvironmentMismatch, match="tictactoe@2 has other spaces or policies than league tictactoe"):
         registry.publisher.publish_mixture(LEAGUE, {1: 0.5, 2: 0.5})
 
@@ -117,9 +99,3 @@ def elsewhere(directory: Path, number: int) -> Manifest:
     return builder()(directory, number).model_copy(
         update={"environment": environment, "environment_digest": environment.digest()}
     )
-
-
-def directory_of(registry: Registry) -> Path:
-    found = registry.storage.home / "other"
-    found.mkdir(parents=True)
-    return found

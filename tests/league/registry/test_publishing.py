@@ -15,13 +15,7 @@ from tempfile import TemporaryDirectory
 import pytest
 from sqlalchemy import select, update
 
-from league.errors import (
-    EnvironmentMismatch,
-    InterfaceChanged,
-    StorageError,
-    UnknownLeague,
-    UnknownVersion,
-)
+from league.errors import EnvironmentMismatch, InterfaceChanged, StorageError, UnknownLeague, UnknownVersion
 from league.registry import publishing
 from league.registry.processes import this_process
 from league.registry.publishing import is_dead
@@ -52,13 +46,6 @@ def test_a_version_has_number_manifest_and_digest(registry: Registry) -> None:
     assert directory == registry.storage.artifacts / LEAGUE / "1"
 
 
-def test_numbers_ascend_and_parents_are_stored(registry: Registry) -> None:
-    publish(registry, "run/1")
-    child = publish(registry, "run/2", parent=1)
-    assert (child.number, child.parent) == (2, 1)
-    assert [version.number for version in registry.versions.all(LEAGUE)] == [1, 2]
-
-
 def test_a_source_is_published_once(registry: Registry) -> None:
     first = publish(registry, "run/1")
 
@@ -80,58 +67,6 @@ def test_of_concurrent_publishers_of_a_source_the_first_wins(registry: Registry)
     assert leftovers(registry) == []
 
 
-def test_unknown_leagues_and_parents_are_rejected(registry: Registry) -> None:
-    with pytest.raises(UnknownLeague):
-        publish(registry, "run/1", league="chess")
-    with pytest.raises(UnknownVersion, match="has no version 7; none is published yet"):
-        publish(registry, "run/1", parent=7)
-    assert rows(registry) == []
-
-
-def test_another_interface_is_rejected(registry: Registry) -> None:
-    with pytest.raises(InterfaceChanged):
-        registry.publisher.publish(LEAGUE, builder(squares=4), source="run/1")
-    assert rows(registry) == []
-    assert leftovers(registry) == []
-
-
-def test_a_manifest_of_another_version_is_rejected(registry: Registry) -> None:
-    with pytest.raises(EnvironmentMismatch, match=r"tictactoe@9 .* expected tictactoe@1"):
-        registry.publisher.publish(LEAGUE, lambda _, __: manifest(9), source="run/1")
-    assert rows(registry) == []
-
-
-@pytest.mark.parametrize("error", [RuntimeError("no parity"), KeyboardInterrupt()])
-def test_a_failed_build_leaves_nothing(registry: Registry, error: BaseException) -> None:
-    def fail(directory: Path, _: int) -> Manifest:
-        (directory / "shared.onnx").write_bytes(GRAPH)
-        raise error
-
-    with pytest.raises(type(error)):
-        registry.publisher.publish(LEAGUE, fail, source="run/1")
-    assert rows(registry) == []
-    assert leftovers(registry) == []
-    assert publish(registry, "run/1").number == 2, "numbers are not reused"
-
-
-def test_a_full_disk_is_reported_in_one_line_and_leaves_nothing(registry: Registry) -> None:
-    def full(directory: Path, _: int) -> Manifest:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(directory / "shared.onnx"))
-
-    with pytest.raises(StorageError, match=r"shared\.onnx cannot be used: No space left on device$"):
-        registry.publisher.publish(LEAGUE, full, source="run/1")
-    assert rows(registry) == []
-    assert leftovers(registry) == []
-
-
-def test_errors_of_the_build_that_are_not_io_errors_are_reraised(registry: Registry) -> None:
-    def unreachable(_: Path, __: int) -> Manifest:
-        raise ConnectionRefusedError(errno.ECONNREFUSED, "refused")
-
-    with pytest.raises(ConnectionRefusedError):
-        registry.publisher.publish(LEAGUE, unreachable, source="run/1")
-
-
 def test_an_expired_reservation_cannot_become_ready(registry: Registry) -> None:
     def build(directory: Path, number: int) -> Manifest:
         with registry.database.write() as session:
@@ -143,49 +78,6 @@ def test_an_expired_reservation_cannot_become_ready(registry: Registry) -> None:
     with pytest.raises(StorageError, match="took too long"):
         registry.publisher.publish(LEAGUE, build, source="run/1")
     assert [version.number for version in registry.versions.all(LEAGUE)] == [2]
-
-
-def test_a_live_publisher_is_not_disturbed(registry: Registry) -> None:
-    def build(directory: Path, number: int) -> Manifest:
-        publish(registry, "run/2")
-        return builder()(directory, number)
-
-    assert registry.publisher.publish(LEAGUE, build, source="run/1").number == 1
-    assert [version.number for version in registry.versions.all(LEAGUE)] == [1, 2]
-
-
-def test_nothing_is_known_of_a_machine_with_the_same_name() -> None:
-    machine, pid, start = this_process().split(":")
-    now, name = datetime.now(UTC), machine.partition("/")[0]
-    assert is_dead(f"{machine}:{pid}:{int(start) - 1}", now)
-    assert not is_dead(f"{name}/another-start/1:{pid}:{int(start) - 1}", now)
-
-
-def test_a_publisher_whose_process_id_was_reused_is_dead() -> None:
-    host, pid, start = this_process().split(":")
-    now = datetime.now(UTC)
-    assert not is_dead(f"{host}:{pid}:{start}", now)
-    assert is_dead(f"{host}:{pid}:{int(start) - 1}", now), "another process with this id"
-    assert not is_dead(f"elsewhere:{pid}:{int(start) - 1}", now), "processes of other hosts are unknown"
-
-
-def test_an_unfinished_publication_reserves_its_number_without_the_database(local: Registry, tmp_path: Path) -> None:
-    local.artifacts.stage(LEAGUE, 7)
-    fresh = Registry.open(Storage(tmp_path, f"sqlite:///{tmp_path / 'new.db'}", local.storage.artifacts))
-    fresh.leagues.register(local.leagues.get(LEAGUE).config, local.leagues.get(LEAGUE).interface)
-    assert publish(fresh, "run/1").number == 8
-    fresh.close()
-
-
-def test_artifacts_survive_the_loss_of_the_database(local: Registry, tmp_path: Path) -> None:
-    publish(local, "run/1")
-    manifest_before = (local.storage.artifacts / LEAGUE / "1" / "manifest.json").read_bytes()
-    storage = Storage(tmp_path, f"sqlite:///{tmp_path / 'new.db'}", local.storage.artifacts)
-    fresh = Registry.open(storage)
-    fresh.leagues.register(local.leagues.get(LEAGUE).config, local.leagues.get(LEAGUE).interface)
-    assert publish(fresh, "run/2").number == 2
-    assert (local.storage.artifacts / LEAGUE / "1" / "manifest.json").read_bytes() == manifest_before
-    fresh.close()
 
 
 CRASH = """
@@ -218,6 +110,8 @@ match point:
 opened = registry.Registry.open(Storage(Path(home), url, Path(home) / "artifacts"))
 opened.publisher.publish(LEAGUE, build, source="run/1")
 """
+
+
 POINTS = ["while building", "before the rename", "after the rename", "while clearing away"]
 
 
@@ -273,13 +167,13 @@ except LeagueError as error:
 """
 
 
-def test_a_disk_quota_error_leaves_nothing(local: Registry) -> None:
-    arguments = [sys.executable, "-c", LIMITED, str(local.storage.home)]
+def test_a_disk_quota_error_leaves_nothing(registry: Registry) -> None:
+    arguments = [sys.executable, "-c", LIMITED, str(registry.storage.home)]
     limited = subprocess.run(arguments, capture_output=True, text=True, check=True)
     assert limited.stdout.startswith("StorageError: ")
     assert limited.stdout.count("\n") == 1
-    assert local.versions.all(LEAGUE) == []
-    assert leftovers(local) == []
+    assert registry.versions.all(LEAGUE) == []
+    assert leftovers(registry) == []
 
 
 READ_ONLY = """
@@ -342,3 +236,74 @@ def test_versions_are_listed_newest_first(registry: Registry) -> None:
     assert [version.number for version in registry.versions.newest(LEAGUE, before=3, limit=5)] == [2, 1]
     with pytest.raises(UnknownLeague):
         registry.versions.newest("chess")
+
+
+def test_unknown_leagues_parents_and_other_spaces_are_rejected(registry: Registry) -> None:
+    with pytest.raises(UnknownLeague):
+        publish(registry, "run/1", league="chess")
+    with pytest.raises(UnknownVersion, match="has no version 7; none is published yet"):
+        publish(registry, "run/1", parent=7)
+    with pytest.raises(InterfaceChanged):
+        registry.publisher.publish(LEAGUE, builder(squares=4), source="run/1")
+    with pytest.raises(EnvironmentMismatch, match=r"tictactoe@9 .* expected tictactoe@\d"):
+        registry.publisher.publish(LEAGUE, lambda _, __: manifest(9), source="run/1")
+    assert rows(registry) == []
+    assert leftovers(registry) == []
+
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "shared.onnx")
+
+
+@pytest.mark.parametrize(
+    ("error", "raised", "message"),
+    [
+        (RuntimeError("no parity"), RuntimeError, "no parity"),
+        (KeyboardInterrupt("ended"), KeyboardInterrupt, "ended"),
+        (ConnectionRefusedError(errno.ECONNREFUSED, "refused"), ConnectionRefusedError, "refused"),
+        (FULL, StorageError, r"shared\.onnx cannot be used: No space left on device$"),
+    ],
+)
+def test_a_failed_build_leaves_nothing(
+    registry: Registry, error: BaseException, raised: type[BaseException], message: str
+) -> None:
+    def fail(directory: Path, _: int) -> Manifest:
+        (directory / "shared.onnx").write_bytes(GRAPH)
+        raise error
+
+    with pytest.raises(raised, match=message):
+        registry.publisher.publish(LEAGUE, fail, source="run/1")
+    assert rows(registry) == []
+    assert leftovers(registry) == []
+    assert publish(registry, "run/1").number == 2, "numbers are not reused"
+
+
+def test_a_live_publisher_is_not_disturbed(registry: Registry) -> None:
+    def build(directory: Path, number: int) -> Manifest:
+        publish(registry, "run/2")
+        return builder()(directory, number)
+
+    assert registry.publisher.publish(LEAGUE, build, source="run/1").number == 1
+    assert publish(registry, "run/3", parent=2).parent == 2
+    assert [version.number for version in registry.versions.all(LEAGUE)] == [1, 2, 3]
+
+
+def test_publishers_that_are_gone_are_dead() -> None:
+    machine, pid, start = this_process().split(":")
+    now, host, other = datetime.now(UTC), machine.partition("/")[0], int(start) - 1
+    assert not is_dead(f"{machine}:{pid}:{start}", now)
+    assert is_dead(f"{machine}:{pid}:{other}", now), "another process with this id"
+    assert not is_dead(f"elsewhere:{pid}:{other}", now), "processes of other hosts are unknown"
+    assert not is_dead(f"{host}/another-start/1:{pid}:{other}", now), "as are those of a machine with the same name"
+
+
+def test_artifacts_survive_the_loss_of_the_database(registry: Registry, tmp_path: Path) -> None:
+    publish(registry, "run/1")
+    path = registry.storage.artifacts / LEAGUE / "1" / "manifest.json"
+    stored = path.read_bytes()
+    fresh = Registry.open(Storage(tmp_path, f"sqlite:///{tmp_path / 'new.db'}", registry.storage.artifacts))
+    fresh.leagues.register(registry.leagues.get(LEAGUE).config, registry.leagues.get(LEAGUE).interface)
+    assert publish(fresh, "run/2").number == 2
+    assert path.read_bytes() == stored
+    registry.artifacts.stage(LEAGUE, 7)
+    assert publish(fresh, "run/3").number == 8, "an unfinished publication reserves its number"
+    fresh.close()

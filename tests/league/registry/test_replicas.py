@@ -13,6 +13,7 @@ from league.registry.storage import database
 from league.registry.storage.database import clock
 from league.registry.storage.rows import ReadPosition
 from league.registry.storage.tables import ReplicaTable
+from tests.support.databases import on_both_databases
 from tests.support.leagues.acknowledgements import acknowledge
 from tests.support.leagues.registries import LEAGUE, registered
 
@@ -20,25 +21,6 @@ from tests.support.leagues.registries import LEAGUE, registered
 def backdate(registry: Registry, replica: str, by: timedelta) -> None:
     with registry.database.write() as session:
         session.execute(update(ReplicaTable).filter_by(replica=replica).values(seen_at=clock(session) - by))
-
-
-def test_a_replica_reports_its_version_repeatedly(registry: Registry) -> None:
-    acknowledge(registry, "replica-1", LEAGUE, None, None, fault="tictactoe@1: manifest.json is missing")
-    acknowledge(registry, "replica-2", LEAGUE, 1, "abc")
-    acknowledge(registry, "replica-1", LEAGUE, 2, "def")
-    found = registry.replicas.acknowledgements(LEAGUE)
-    assert [(row.replica, row.version, row.sha256, row.fault) for row in found] == [
-        ("replica-1", 2, "def", None),
-        ("replica-2", 1, "abc", None),
-    ]
-    with registry.database.read() as session:
-        assert all(clock(session) - row.seen_at < timedelta(minutes=1) for row in found)
-
-
-def test_faults_are_stored(registry: Registry) -> None:
-    acknowledge(registry, "replica-1", LEAGUE, 1, "abc", fault="tictactoe@2: shared.onnx was changed")
-    (row,) = registry.replicas.acknowledgements(LEAGUE)
-    assert (row.version, row.fault) == (1, "tictactoe@2: shared.onnx was changed")
 
 
 def test_a_silent_replica_is_listed(registry: Registry) -> None:
@@ -74,36 +56,6 @@ def test_replicas_that_are_being_stopped_are_counted_until_they_end(registry: Re
     assert registry.replicas.counts() == (1, 0, 0)
 
 
-def test_a_registered_replica_is_listed_before_it_serves_a_league(registry: Registry) -> None:
-    registry.replicas.register("replica-1", {"machine": "here"})
-    (row,) = registry.replicas.acknowledgements(LEAGUE)
-    assert (row.replica, row.version, row.aliases, row.event) == ("replica-1", None, {}, None)
-    (replica,) = registry.replicas.registered()
-    assert (replica.process, replica.seen_at) == ({"machine": "here"}, row.seen_at)
-
-
-def test_a_replica_that_is_not_registered_cannot_acknowledge(registry: Registry) -> None:
-    """Another replica may take one for dead that is not: it registers again, and acknowledges everything."""
-    assert not registry.replicas.register("replica-1", {"machine": "here"})
-    assert registry.replicas.register("replica-1", {"machine": "here"})
-    acknowledge(registry, "replica-1", LEAGUE, 1, "abc", event=7)
-    registry.replicas.remove("replica-1")
-    assert not registry.replicas.acknowledge("replica-1", ReadPosition(7, 7, 0), {})
-    assert registry.replicas.acknowledgements(LEAGUE) == []
-    assert not registry.replicas.register("replica-1", {"machine": "here"})
-    (row,) = registry.replicas.acknowledgements(LEAGUE)
-    assert (row.replica, row.version, row.event) == ("replica-1", None, None)
-
-
-def test_a_position_is_acknowledged_by_a_replica_that_is_registered(registry: Registry) -> None:
-    assert not registry.replicas.acknowledge("replica-1", ReadPosition(7, 7, 0), {}, ())
-    registry.replicas.register("replica-1", {"machine": "here"})
-    assert registry.replicas.acknowledge("replica-1", ReadPosition(7, 7, 0), {}, ())
-    with registry.database.read() as session:
-        (row,) = session.scalars(select(ReplicaTable))
-        assert (row.changes, row.event, row.traffic, row.process) == (7, 7, 0, {"machine": "here"})
-
-
 def test_leagues_that_differ_have_a_row_until_they_are_settled(registry: Registry) -> None:
     registered(registry, "another")
     for league in (LEAGUE, "another"):
@@ -116,7 +68,8 @@ def test_leagues_that_differ_have_a_row_until_they_are_settled(registry: Registr
     assert [registry.replicas.acknowledgements(league)[0].fault for league in faults] == [None, None]
 
 
-@pytest.mark.parametrize("hours", [-1, 1, 25])
+@on_both_databases
+@pytest.mark.parametrize("hours", [-1, 25])
 def test_times_are_those_of_the_database(registry: Registry, monkeypatch: pytest.MonkeyPatch, hours: int) -> None:
     """A replica whose clock is wrong is seen alive, and removes nobody."""
     if registry.database.engine.dialect.name == "sqlite":
@@ -128,30 +81,9 @@ def test_times_are_those_of_the_database(registry: Registry, monkeypatch: pytest
     acknowledge(registry, "replica-2", LEAGUE, 1, "abc")
     registry.replicas.register("replica-2", {})
     monkeypatch.undo()
-    found = registry.replicas.acknowledgements(LEAGUE)
-    assert [row.replica for row in found] == ["replica-1", "replica-2"]
-    assert all(abs(row.silence) < LIVENESS_TIMEOUT for row in found)
-
-
-def test_a_stopped_replica_is_deleted(registry: Registry) -> None:
-    registered(registry, "another")
-    acknowledge(registry, "replica-1", LEAGUE, 1, "abc")
-    acknowledge(registry, "replica-1", "another", 1, "abc")
-    acknowledge(registry, "replica-2", LEAGUE, 1, "abc")
-    registry.replicas.remove("replica-1")
-    assert [row.replica for row in registry.replicas.acknowledgements(LEAGUE)] == ["replica-2"]
-    assert [row.replica for row in registry.replicas.acknowledgements("another")] == ["replica-2"]
-
-
-def test_an_unknown_league_is_rejected(registry: Registry) -> None:
-    with pytest.raises(UnknownLeague):
-        registry.replicas.acknowledgements("chess")
-
-
-def test_a_replica_reports_the_version_of_each_alias(registry: Registry) -> None:
-    acknowledge(registry, "replica-1", LEAGUE, 2, "abc", None, {"champion": 2, "candidate": 3})
-    (row,) = registry.replicas.acknowledgements(LEAGUE)
-    assert row.aliases == {"champion": 2, "candidate": 3}
+    rows = registry.replicas.acknowledgements(LEAGUE)
+    assert [row.replica for row in rows] == ["replica-1", "replica-2"]
+    assert all(abs(row.silence) < LIVENESS_TIMEOUT for row in rows)
 
 
 def test_any_acknowledgement_is_a_sign_of_life(registry: Registry) -> None:
@@ -162,3 +94,44 @@ def test_any_acknowledgement_is_a_sign_of_life(registry: Registry) -> None:
     acknowledge(registry, "replica-1", "another", 1, "abc")
     silences = {row.replica: row.silence for row in registry.replicas.acknowledgements(LEAGUE)}
     assert silences["replica-1"] < LIVENESS_TIMEOUT < silences["replica-2"]
+
+
+@on_both_databases
+def test_a_replica_reports_its_versions_repeatedly(registry: Registry) -> None:
+    acknowledge(registry, "replica-1", LEAGUE, None, None, fault="tictactoe@1: manifest.json is missing")
+    acknowledge(registry, "replica-2", LEAGUE, 1, "abc", "tictactoe@2: shared.onnx was changed")
+    acknowledge(registry, "replica-1", LEAGUE, 2, "def", None, {"champion": 2, "candidate": 3})
+    rows = registry.replicas.acknowledgements(LEAGUE)
+    assert [(row.replica, row.version, row.sha256, row.fault, row.aliases) for row in rows] == [
+        ("replica-1", 2, "def", None, {"champion": 2, "candidate": 3}),
+        ("replica-2", 1, "abc", "tictactoe@2: shared.onnx was changed", {}),
+    ]
+    with registry.database.read() as session:
+        assert all(clock(session) - row.seen_at < timedelta(minutes=1) for row in rows)
+    with pytest.raises(UnknownLeague):
+        registry.replicas.acknowledgements("chess")
+
+
+def test_only_a_registered_replica_acknowledges(registry: Registry) -> None:
+    """Another replica may take one for dead that is not: it registers again, and acknowledges everything."""
+    position = ReadPosition(7, 7, 0)
+    assert not registry.replicas.acknowledge("replica-1", position, {}, ())
+    assert not registry.replicas.register("replica-1", {"machine": "here"})
+    assert registry.replicas.register("replica-1", {"machine": "here"})
+    (row,) = registry.replicas.acknowledgements(LEAGUE)
+    assert (row.replica, row.version, row.aliases, row.event) == ("replica-1", None, {}, None)
+    assert registry.replicas.acknowledge("replica-1", position, {}, ())
+    (replica,) = registry.replicas.registered()
+    assert replica.process == {"machine": "here"}
+    with registry.database.read() as session:
+        (stored,) = session.scalars(select(ReplicaTable))
+        assert (stored.changes, stored.event, stored.traffic) == (7, 7, 0)
+    registered(registry, "another")
+    for league in (LEAGUE, "another"):
+        acknowledge(registry, "replica-1", league, 1, "abc", event=7)
+    registry.replicas.remove("replica-1")
+    assert not registry.replicas.acknowledge("replica-1", position, {})
+    assert registry.replicas.acknowledgements(LEAGUE) == registry.replicas.acknowledgements("another") == []
+    assert not registry.replicas.register("replica-1", {"machine": "here"})
+    (row,) = registry.replicas.acknowledgements(LEAGUE)
+    assert (row.replica, row.version, row.event) == ("replica-1", None, None)

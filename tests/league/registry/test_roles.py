@@ -27,21 +27,16 @@ def registry(tmp_path: Path) -> Registry:
     return opened
 
 
-def test_versions_have_a_role(registry: Registry) -> None:
+def test_an_exploiter_cannot_become_champion(registry: Registry) -> None:
     main, exploiter = registry.versions.all(LEAGUE)
     assert (main.role, main.exploits) == (MAIN, None)
     assert (exploiter.role, exploiter.exploits) == (EXPLOITER, "tictactoe@1")
     assert registry.versions.exploiters(LEAGUE, ["tictactoe@1", "tictactoe@2"]) == [exploiter]
     assert registry.versions.exploiters(LEAGUE, ["tictactoe@2"]) == []
-
-
-def test_an_exploiter_cannot_become_champion(registry: Registry) -> None:
     with pytest.raises(NotPromotable, match=REFUSED):
         registry.aliases.set(LEAGUE, "champion", 2, expected=None, actor="test", reason="test")
     with pytest.raises(NotPromotable, match=REFUSED):
         registry.traffic.set(LEAGUE, canary=Portion(2, 0.1), actor="test", reason="test")
-    registry.aliases.set(LEAGUE, "spar", 2, expected=None, actor="test", reason="test")
-    assert registry.aliases.current(LEAGUE) == {"spar": 2}
 
 
 def test_a_shadow_that_has_become_an_exploiter_does_not_prevent_a_canary(registry: Registry) -> None:

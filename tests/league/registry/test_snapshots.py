@@ -9,47 +9,36 @@ from sqlalchemy.exc import StatementError
 from league.errors import UnknownLeague
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
+from tests.support.databases import on_both_databases
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
 from tests.support.leagues.registries import LEAGUE, config, interface, publish, registered
 
 
+@on_both_databases
 def test_a_snapshot_is_stored_with_its_mark(registry: Registry) -> None:
     assert registry.snapshots.get(LEAGUE, "leaderboard") is None
-    registry.snapshots.put(LEAGUE, {"leaderboard": [1, 2], "payoff": None}, mark="a")
-    first = registry.snapshots.get(LEAGUE, "leaderboard")
-    assert first is not None
-    assert (first.document, first.mark) == ([1, 2], "a")
-    nothing = registry.snapshots.get(LEAGUE, "payoff")
-    assert nothing is not None
-    assert nothing.document is None
-    registry.snapshots.put(LEAGUE, {"leaderboard": {"games": 3}, "payoff": None}, mark="b")
-    second = registry.snapshots.get(LEAGUE, "leaderboard")
-    assert second is not None
-    assert (second.document, second.mark) == ({"games": 3}, "b")
-    assert second.at >= first.at
-    assert registry.snapshots.marks(LEAGUE) == {"payoff": "b", "leaderboard": "b"}
-
-
-def test_a_part_of_all_leagues_is_read_at_once(registry: Registry) -> None:
-    registered(registry, "chess")
-    assert registry.snapshots.of_part("summary") == {}
-    registry.snapshots.put(LEAGUE, {"summary": {"games": 1}, "other": 0}, mark="a")
-    registry.snapshots.put("chess", {"summary": {"games": 2}}, mark="a")
-    found = registry.snapshots.of_part("summary")
-    assert {league: row.document["games"] for league, row in found.items()} == {"chess": 2, LEAGUE: 1}
-
-
-def test_several_parts_are_stored_together_or_not_at_all(registry: Registry) -> None:
     with pytest.raises((StatementError, ValueError), match="not JSON compliant"):
-        registry.snapshots.put(LEAGUE, {"a": 1, "b": float("nan")}, mark="a")
-    assert registry.snapshots.marks(LEAGUE) == {}
-
-
-def test_an_unknown_league_is_reported(registry: Registry) -> None:
-    with pytest.raises(UnknownLeague, match="chess"):
-        registry.snapshots.get("chess", "leaderboard")
-    with pytest.raises(UnknownLeague, match="chess"):
-        registry.snapshots.put("chess", {"leaderboard": []}, mark="a")
+        registry.snapshots.put(LEAGUE, {"payoff": 1, "leaderboard": float("nan")}, mark="a")
+    assert registry.snapshots.marks(LEAGUE) == {}, "parts are stored together or not at all"
+    stored = []
+    for document, mark in (([1, 2], "a"), ({"games": 3}, "b")):
+        registry.snapshots.put(LEAGUE, {"leaderboard": document, "payoff": None}, mark=mark)
+        rows = [registry.snapshots.get(LEAGUE, part) for part in ("leaderboard", "payoff")]
+        assert [(row.document, row.mark) for row in rows if row] == [(document, mark), (None, mark)]
+        stored += rows[:1]
+    assert stored[1].at >= stored[0].at
+    assert registry.snapshots.marks(LEAGUE) == {"payoff": "b", "leaderboard": "b"}
+    registered(registry, "chess")
+    registry.snapshots.put("chess", {"leaderboard": {"games": 2}}, mark="a")
+    documents = {league: row.document for league, row in registry.snapshots.of_part("leaderboard").items()}
+    assert documents == {"chess": {"games": 2}, LEAGUE: {"games": 3}}
+    assert registry.snapshots.of_part("summary") == {}
+    for unknown in (
+        lambda: registry.snapshots.get("go", "leaderboard"),
+        lambda: registry.snapshots.put("go", {"leaderboard": []}, mark="a"),
+    ):
+        with pytest.raises(UnknownLeague, match="go"):
+            unknown()
 
 
 CHANGES: dict[str, Callable[[Registry], object]] = {
@@ -61,6 +50,7 @@ CHANGES: dict[str, Callable[[Registry], object]] = {
     ),
     "a verdict": lambda registry: registry.verdicts.open(LEAGUE, 1, "script:random", "another", {}),
     "its end": lambda registry: registry.verdicts.close(SCHEDULE.id, "reject", {}),
+    "the end of the other": lambda registry: registry.verdicts.close("another", "reject", {}),
     "its being voided": lambda registry: registry.verdicts.void(SCHEDULE.id, "a mistake"),
     "another environment": lambda registry: registry.leagues.register(
         config(kwargs={"render_mode": "rgb_array"}), interface()
@@ -75,24 +65,15 @@ def test_the_mark_of_a_league_changes_with_its_data(registry: Registry) -> None:
     ledger.append(play_match(SCHEDULE, 0))
     registry.verdicts.open(LEAGUE, 1, "script:random", SCHEDULE.id, {})
     registered(registry, "chess", versions=1)
-    seen = [registry.snapshots.current_marks()]
-    for what, change in CHANGES.items():
-        if what == "its being voided":
-            registry.verdicts.close("another", "reject", {})
-            seen.append(registry.snapshots.current_marks())
-        change(registry)
-        now = registry.snapshots.current_marks()
-        assert now[LEAGUE] not in {before[LEAGUE] for before in seen}, what
-        assert now["chess"] == seen[0]["chess"]
-        seen.append(now)
-
-
-def test_a_mark_is_stable_without_relevant_changes(registry: Registry) -> None:
-    ledger = Ledger(registry)
-    marks = registry.snapshots.current_marks()
+    marks = [registry.snapshots.current_marks()]
     ledger.open(replace(SCHEDULE, id="not played"))
     registry.keys.create("bot", ["read"])
-    assert registry.snapshots.current_marks() == marks
+    assert registry.snapshots.current_marks() == marks[0]
+    for what, change in CHANGES.items():
+        change(registry)
+        marks.append(registry.snapshots.current_marks())
+        assert marks[-1][LEAGUE] not in {before[LEAGUE] for before in marks[:-1]}, what
+        assert marks[-1]["chess"] == marks[0]["chess"]
 
 
 def test_verdict_reasons_are_read_without_the_curves(registry: Registry) -> None:

@@ -14,6 +14,7 @@ from league.registry.storage.database import clock
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic
 from league.registry.storage.tables import ReplicaReportTable
+from tests.support.databases import on_both_databases
 from tests.support.leagues.acknowledgements import acknowledge
 from tests.support.leagues.registries import LEAGUE, registered
 
@@ -27,37 +28,6 @@ def versioned(registry: Registry) -> Registry:
 
 def set_traffic(registry: Registry, **portions: Portion | None) -> Traffic:
     return registry.traffic.set(LEAGUE, actor="ada", reason="test", **portions)
-
-
-def test_settings_that_are_not_named_remain(versioned: Registry) -> None:
-    assert versioned.traffic.current(LEAGUE) == Traffic(LEAGUE)
-    set_traffic(versioned, canary=Portion(2, 0.05))
-    set_traffic(versioned, shadow=Portion(3, 1.0))
-    current = versioned.traffic.current(LEAGUE)
-    assert (current.canary, current.shadow, current.actor, current.reason) == (
-        Portion(2, 0.05),
-        Portion(3, 1.0),
-        "ada",
-        "test",
-    )
-    set_traffic(versioned, canary=None)
-    assert versioned.traffic.all() == {LEAGUE: versioned.traffic.current(LEAGUE)}
-    assert [(one.canary, one.shadow) for one in versioned.traffic.history(LEAGUE)] == [
-        (None, Portion(3, 1.0)),
-        (Portion(2, 0.05), Portion(3, 1.0)),
-        (Portion(2, 0.05), None),
-    ]
-
-
-def test_an_unchanged_setting_creates_no_event(versioned: Registry) -> None:
-    first = set_traffic(versioned, canary=Portion(2, 0.05))
-    assert set_traffic(versioned, canary=Portion(2, 0.05)) == first
-    assert len(versioned.traffic.history(LEAGUE)) == 1
-
-
-def test_an_alias_is_stored_as_an_alias(versioned: Registry) -> None:
-    versioned.aliases.set(LEAGUE, "candidate", 2, expected=ANY, actor="test", reason="test")
-    assert set_traffic(versioned, shadow=Portion("candidate", 1.0)).shadow == Portion("candidate", 1.0)
 
 
 def test_only_existing_versions_get_traffic(versioned: Registry) -> None:
@@ -96,6 +66,7 @@ def shadow_counts(candidate: int = 2, requests: int = 10, **counts: int) -> Shad
     return ShadowCounts(LEAGUE, candidate, 1, requests, **fields, latency=latency, ns=requests * 1000)
 
 
+@on_both_databases
 def test_shadow_counts_are_summed_and_outlive_their_replicas(versioned: Registry) -> None:
     versioned.replicas.write_report("replica-1", {}, [shadow_counts(requests=5)])
     versioned.replicas.write_report(
@@ -134,3 +105,18 @@ def test_waiting_for_replicas_to_follow(versioned: Registry) -> None:
     set_traffic(versioned, canary=None)
     with pytest.raises(Conflict, match="was changed in the meantime"):
         versioned.changes.wait_for_traffic(setting, 0)
+
+
+def test_a_setting_has_its_actor_and_reason(versioned: Registry) -> None:
+    versioned.aliases.set(LEAGUE, "candidate", 3, expected=ANY, actor="test", reason="test")
+    setting = set_traffic(versioned, canary=Portion(2, 0.05))
+    assert (setting.actor, setting.reason) == ("ada", "test")
+    assert set_traffic(versioned, canary=Portion(2, 0.05)) == setting, "unchanged"
+    assert versioned.traffic.all() == {LEAGUE: setting}
+    both = set_traffic(versioned, shadow=Portion("candidate", 1.0))
+    assert (both.canary, both.shadow) == (Portion(2, 0.05), Portion("candidate", 1.0)), "what is not named remains"
+    assert set_traffic(versioned, canary=None).shadow == both.shadow
+    assert [(row.canary, row.shadow) for row in versioned.traffic.history(LEAGUE)][::2] == [
+        (None, both.shadow),
+        (setting.canary, None),
+    ]

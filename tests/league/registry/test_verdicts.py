@@ -1,3 +1,5 @@
+"""Verdicts, and the nightly runs that open them."""
+
 import math
 
 import pytest
@@ -16,6 +18,8 @@ from league.registry.registry import Registry
 from tests.support.leagues.registries import LEAGUE, registered
 
 SETTINGS = {"model": "normalized", "elo0": 0.0, "elo1": 30.0, "alpha": 0.05, "beta": 0.05, "max_blocks": 2000}
+
+
 EVIDENCE = {"llr": 2.97, "counts": [1, 2, 3, 4, 5]}
 
 
@@ -29,6 +33,10 @@ def test_a_verdict_is_opened_once_and_closed_once(registry: Registry) -> None:
     assert (opened.candidate, opened.champion, opened.schedule) == (2, "tictactoe@1", "schedule-1")
     assert (opened.outcome, opened.evidence, opened.closed_at) == (None, None, None)
     assert registry.verdicts.open(LEAGUE, 2, "tictactoe@1", "schedule-1", SETTINGS) == opened
+    with pytest.raises(Conflict, match="opened with candidate 2, not 1"):
+        registry.verdicts.open(LEAGUE, 1, "tictactoe@1", "schedule-1", SETTINGS)
+    with pytest.raises(Conflict, match="opened with settings"):
+        registry.verdicts.open(LEAGUE, 2, "tictactoe@1", "schedule-1", SETTINGS | {"alpha": 0.1})
     registry.verdicts.close(opened.id, "promote", EVIDENCE)
     (closed,) = registry.verdicts.all(LEAGUE)
     registry.verdicts.close(opened.id, "promote", {"llr": 0.0})
@@ -36,21 +44,57 @@ def test_a_verdict_is_opened_once_and_closed_once(registry: Registry) -> None:
     assert (closed.outcome, closed.evidence, closed.settings) == ("promote", EVIDENCE, SETTINGS)
     assert closed.closed_at is not None
     assert closed.closed_at >= closed.opened_at
+    with pytest.raises(Conflict, match="is already 'promote'"):
+        registry.verdicts.close("schedule-1", "reject", EVIDENCE)
 
 
-def test_a_closed_verdict_cannot_change(registry: Registry) -> None:
-    registry.verdicts.open(LEAGUE, 2, "tictactoe@1", "schedule-1", SETTINGS)
-    registry.verdicts.close("schedule-1", "reject", EVIDENCE)
-    with pytest.raises(Conflict, match="is already 'reject'"):
-        registry.verdicts.close("schedule-1", "promote", EVIDENCE)
+def test_verdicts_are_listed_in_order_of_opening(registry: Registry) -> None:
+    names = ["c", "a", "d", "b"]
+    for name in names:
+        registry.verdicts.open(LEAGUE, 2, "tictactoe@1", name, SETTINGS)
+    assert [verdict.id for verdict in registry.verdicts.all(LEAGUE)] == names
+    assert [row.id for row in registry.verdicts.newest(LEAGUE)] == names[::-1]
+    assert [row.id for row in registry.verdicts.newest(LEAGUE, limit=2)] == names[:1:-1]
+    assert [row.id for row in registry.verdicts.newest(LEAGUE, before="d", limit=5)] == names[1::-1]
+    with pytest.raises(InvalidInput, match="before: league tictactoe has no verdict 'e'"):
+        registry.verdicts.newest(LEAGUE, before="e")
 
 
-def test_a_schedule_has_one_verdict(registry: Registry) -> None:
-    registry.verdicts.open(LEAGUE, 2, "tictactoe@1", "schedule-1", SETTINGS)
-    with pytest.raises(Conflict, match="opened with candidate 2, not 1"):
-        registry.verdicts.open(LEAGUE, 1, "tictactoe@1", "schedule-1", SETTINGS)
-    with pytest.raises(Conflict, match="opened with settings"):
-        registry.verdicts.open(LEAGUE, 2, "tictactoe@1", "schedule-1", SETTINGS | {"alpha": 0.1})
+def test_a_verdict_can_be_voided_unless_it_is_being_applied(registry: Registry) -> None:
+    settings = {"gate": {"alpha": 0.01}}
+    registry.verdicts.open(LEAGUE, 2, "tictactoe@1", "s", settings)
+    voided = registry.verdicts.void("s", "voided by me: games of a broken machine")
+    assert (voided.outcome, voided.alpha) == ("void", 0.01)
+    assert voided.evidence == {"note": "voided by me: games of a broken machine"}
+    assert voided.closed_at is not None
+    assert registry.verdicts.void("s", "again") == voided
+    with pytest.raises(Conflict, match="is already 'void'"):
+        registry.verdicts.close("s", "promote", {})
+    with pytest.raises(Conflict, match="cannot promote"):
+        registry.aliases.set(LEAGUE, "champion", 2, expected=None, actor="a", reason="r", verdict="s")
+    registry.verdicts.open(LEAGUE, 2, "script:random", "t", settings)
+    registry.aliases.set(LEAGUE, "champion", 2, expected=None, actor="a", reason="r", verdict="t")
+    with pytest.raises(Conflict, match="is being applied"):
+        registry.verdicts.void("t", "why")
+    registry.verdicts.close("t", "promote", {"llr": -3.0})
+    assert registry.verdicts.void("t", "why").evidence == {"llr": -3.0, "note": "why"}
+    assert registry.aliases.current(LEAGUE) == {"champion": 2}
+
+
+def test_a_nightly_run_is_opened_once(registry: Registry) -> None:
+    night = registry.nightly_runs.open(LEAGUE, [3, 2], 0.001)
+    assert (night.candidates, night.alpha, night.report, night.ended_at) == ((2, 3), 0.001, None, None)
+    assert registry.nightly_runs.open(LEAGUE, [1], 0.5) == night
+    registry.nightly_runs.close(night.id, {"champion": "tictactoe@2"})
+    registry.nightly_runs.close(night.id, {})
+    (ended,) = registry.nightly_runs.all(LEAGUE)
+    assert ended.report == {"champion": "tictactoe@2"}
+    assert ended.ended_at is not None
+    assert registry.nightly_runs.open(LEAGUE, [1], 0.5).candidates == (1,)
+    assert len(registry.nightly_runs.all(LEAGUE)) == 2
+    for unknown in (lambda: registry.nightly_runs.open("chess", [1], 0.1), lambda: registry.nightly_runs.all("chess")):
+        with pytest.raises(UnknownLeague):
+            unknown()
 
 
 def test_unknown_versions_verdicts_and_leagues_are_rejected(registry: Registry) -> None:
@@ -98,23 +142,6 @@ def test_evidence_must_be_finite(registry: Registry) -> None:
     with pytest.raises((StatementError, ValueError), match="not JSON compliant"):
         registry.verdicts.close("schedule-1", "promote", {"llr": math.inf})
     assert registry.verdicts.all(LEAGUE)[0].outcome is None
-
-
-def test_verdicts_are_listed_in_order_of_opening(registry: Registry) -> None:
-    for schedule in ("b", "a", "c"):
-        registry.verdicts.open(LEAGUE, 2, "tictactoe@1", schedule, SETTINGS)
-    assert [verdict.id for verdict in registry.verdicts.all(LEAGUE)] == ["b", "a", "c"]
-
-
-def test_verdicts_are_paginated_newest_first(registry: Registry) -> None:
-    names = ["c", "a", "d", "b"]
-    for name in names:
-        registry.verdicts.open(LEAGUE, 2, "tictactoe@1", name, SETTINGS)
-    assert [row.id for row in registry.verdicts.newest(LEAGUE)] == names[::-1]
-    assert [row.id for row in registry.verdicts.newest(LEAGUE, limit=2)] == names[:1:-1]
-    assert [row.id for row in registry.verdicts.newest(LEAGUE, before="d", limit=5)] == names[1::-1]
-    with pytest.raises(InvalidInput, match="before: league tictactoe has no verdict 'e'"):
-        registry.verdicts.newest(LEAGUE, before="e")
 
 
 def test_the_last_verdict_of_a_league_is_the_last_one_closed(registry: Registry) -> None:

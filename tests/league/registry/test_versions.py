@@ -1,5 +1,7 @@
 """Notes on versions."""
 
+from typing import Any
+
 import pytest
 
 from league.errors import InvalidInput, UnknownAlias, UnknownLeague, UnknownVersion
@@ -21,39 +23,27 @@ def texts(registry: Registry, league: str = LEAGUE) -> list[str | None]:
 
 
 def test_the_latest_note_of_each_version_is_shown(versioned: Registry) -> None:
+    def note(version: int | str, text: str, actor: str = "ada") -> Any:
+        return versioned.versions.set_note(CheckpointRef(LEAGUE, version), text, actor=actor)
+
     assert texts(versioned) == [None, None, None]
-    versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "first", actor="ada")
-    written = versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "  more entropy\n", actor="bob").note
-    versioned.versions.set_note(CheckpointRef(LEAGUE, 1), "another", actor="ada")
+    note(2, "first")
+    written = note(2, "  more entropy\n", "bob").note
+    note(1, "another")
     assert texts(versioned) == ["another", "more entropy", None]
     assert texts(versioned, "chess") == [None]
-    assert written is not None
     assert (written.text, written.actor) == ("more entropy", "bob")
     assert versioned.versions.get(LEAGUE, 2).note == written
     assert [row.note for row in versioned.versions.newest(LEAGUE, limit=2)] == [None, written]
-
-
-def test_an_empty_note_removes_it(versioned: Registry) -> None:
-    versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "first", actor="ada")
-    assert versioned.versions.set_note(CheckpointRef(LEAGUE, 2), " ", actor="ada").note is None
-    assert texts(versioned) == [None, None, None]
-    versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "again", actor="ada")
-    assert texts(versioned) == [None, "again", None]
-
-
-def test_an_unchanged_note_has_no_effect(versioned: Registry) -> None:
-    first = versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "a try", actor="ada").note
-    seen = versioned.changes.token(LEAGUE)
-    assert versioned.versions.set_note(CheckpointRef(LEAGUE, 2), "a try ", actor="bob").note == first
-    assert versioned.versions.set_note(CheckpointRef(LEAGUE, 1), "", actor="bob").note is None
-    assert versioned.changes.token(LEAGUE) == seen
-
-
-def test_an_alias_selects_its_current_version(versioned: Registry) -> None:
+    token = versioned.changes.token(LEAGUE)
+    assert note(2, "more entropy ", "ann").note == written
+    assert note(3, "").note is None
+    assert versioned.changes.token(LEAGUE) == token, "unchanged notes have no effect"
+    assert note(2, " ").note is None
     versioned.aliases.set(LEAGUE, "champion", 3, expected=ANY, actor="test", reason="test")
-    assert versioned.versions.set_note(CheckpointRef(LEAGUE, "champion"), "won", actor="ada").number == 3
+    assert note("champion", "won").number == 3
     versioned.aliases.set(LEAGUE, "champion", 1, expected=ANY, actor="test", reason="test")
-    assert texts(versioned) == [None, None, "won"]
+    assert texts(versioned) == ["another", None, "won"]
 
 
 def test_an_invalid_note_changes_nothing(versioned: Registry) -> None:

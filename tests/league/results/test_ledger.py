@@ -31,6 +31,7 @@ from league.results.records import (
 )
 from league.results.sums import GameSums, whole
 from league.settings import Storage
+from tests.support.databases import on_both_databases
 from tests.support.leagues.ledger_matches import SCHEDULE, game, play_match
 from tests.support.leagues.registries import LEAGUE, registered
 from tests.support.small_disk import small_disk
@@ -41,52 +42,6 @@ def ledger(storage: Storage) -> Iterator[Ledger]:
     registry = registered(Registry.open(storage))
     yield Ledger(registry)
     registry.close()
-
-
-def test_a_schedule_is_stored_once(ledger: Ledger) -> None:
-    assert ledger.open(SCHEDULE) == SCHEDULE
-    assert ledger.open(replace(SCHEDULE, length=5)) == SCHEDULE
-    second = replace(SCHEDULE, id="a-later-one")
-    ledger.open(second)
-    assert ledger.schedules(LEAGUE) == [SCHEDULE, second]
-
-
-def test_a_schedule_of_an_unknown_league_is_rejected(ledger: Ledger) -> None:
-    with pytest.raises(UnknownLeague):
-        ledger.open(replace(SCHEDULE, league="chess"))
-
-
-def test_matches_are_returned_exactly_in_schedule_order(ledger: Ledger) -> None:
-    ledger.open(SCHEDULE)
-    for position in (4, 0, 2):
-        assert ledger.append(play_match(SCHEDULE, position)) is True
-    expected = [play_match(SCHEDULE, position) for position in (0, 2, 4)]
-    assert ledger.matches(league=LEAGUE) == expected
-    assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id) == expected
-    assert ledger.matches(league=LEAGUE, schedule="another") == []
-    assert ledger.positions(SCHEDULE.id) == {0, 2, 4}
-    assert ledger.positions("another") == set()
-
-
-def test_a_match_is_stored_once(ledger: Ledger) -> None:
-    ledger.open(SCHEDULE)
-    match = play_match(SCHEDULE, 3)
-    assert ledger.append(match) is True
-    other_moves = replace(match, games=tuple(replace(game, actions=(8,)) for game in match.games))
-    assert ledger.append(match) is False
-    assert ledger.append(other_moves) is False
-    assert ledger.matches(league=LEAGUE) == [match]
-
-
-def test_several_matches_are_stored_together_or_not_at_all(ledger: Ledger) -> None:
-    ledger.open(SCHEDULE)
-    ledger.append(play_match(SCHEDULE, 1))
-    assert ledger.extend([]) == 0
-    assert ledger.extend([play_match(SCHEDULE, position) for position in range(3)]) == 2
-    broken = replace(play_match(SCHEDULE, 4), seed=1)
-    with pytest.raises(LedgerConflict):
-        ledger.extend([play_match(SCHEDULE, 3), broken])
-    assert ledger.positions(SCHEDULE.id) == {0, 1, 2}
 
 
 def test_the_size_of_a_schedule_is_limited(ledger: Ledger, storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,6 +70,7 @@ def test_games_leave_space_on_the_disk_of_the_database(tmp_path: Path) -> None:
         registry.close()
 
 
+@on_both_databases
 def test_results_are_sums_over_blocks(ledger: Ledger) -> None:
     other = replace(SCHEDULE, id="of another game", game_digest="0" * 64)
     for schedule in (other, SCHEDULE):
@@ -235,125 +191,70 @@ def solo_match(schedule: Schedule, position: int, *returns: float) -> Match:
     return schedule.match(position, games)
 
 
-def test_a_block_of_solo_games_is_one_comparison(ledger: Ledger) -> None:
-    schedule = replace(SCHEDULE, sides=("team",), scoring="side", opening_plies=0)
-    ledger.open(schedule)
-    ledger.extend([solo_match(schedule, 0, 3.5, 2.0), solo_match(schedule, 1, 3.5, 4.0)])
-    won, lost = ledger.matches(league=LEAGUE)
-    assert (won, lost) == (solo_match(schedule, 0, 3.5, 2.0), solo_match(schedule, 1, 3.5, 4.0))
-    assert (won.score(0), won.score(1), lost.score(0)) == (1.0, 0.0, 0.0)
-    assert (won.mean_return(0), won.mean_return(1)) == (3.5, 2.0)
-    sums = ledger.sums(LEAGUE, [schedule])
-    assert [(of_pair.points, of_pair.played) for of_pair in whole(sums).values()] == [((1.0, 0.0), 1), ((1.0, 0.0), 1)]
-    assert won.result() == BlockResult(schedule.id, 0, won.contestants, 1, (1.0, 0.0), (3.5, 2.0))
-
-
-def test_a_contestant_that_did_not_play_has_no_return(ledger: Ledger) -> None:
-    schedule = replace(SCHEDULE, sides=("team",), scoring="side", opening_plies=0)
-    ledger.open(schedule)
-    match = solo_match(schedule, 0, 3.5, 2.0)
-    both = replace(match.games[0], returns=(3.5, 2.0), scores=(1.0, 0.0))
-    with pytest.raises(LedgerConflict, match="finite return of each contestant that played"):
-        ledger.append(replace(match, games=(both, match.games[1])))
-
-
-def _change_second_game(change: Callable[[Game], Game]) -> Callable[[Match], Match]:
-    return lambda match: replace(match, games=(match.games[0], change(match.games[1])))
-
-
 CRASH = Forfeit(0, "player_2", "crashed")
-REJECTED: dict[str, tuple[Callable[[Match], Match], str]] = {
-    "beyond the schedule": (lambda match: replace(match, position=9), "ends before position 9"),
-    "before the schedule": (lambda match: replace(match, position=-1), "ends before position 9"),
-    "another id": (lambda match: replace(match, id="x/1"), "its id is 'x/1'"),
-    "another league": (lambda match: replace(match, league="chess"), "its league is 'chess'"),
-    "unknown contestants": (
-        lambda match: replace(match, contestants=("tictactoe@1", "tictactoe@9")),
-        "its contestants is .*tictactoe@9",
-    ),
-    "other contestants of the schedule": (
-        lambda match: replace(match, contestants=("tictactoe@1", "tictactoe@2")),
-        "its contestants is",
-    ),
-    "another block's seed": (lambda match: replace(match, seed=SCHEDULE.seed_at(2)), "its seed is"),
-    "another environment": (
-        lambda match: replace(match, environment_digest="0" * 64),
-        "its environment_digest is",
-    ),
-    "no games": (lambda match: replace(match, games=()), "has 0 games, expected 2"),
-    "odd games": (lambda match: replace(match, games=match.games[:1]), "has 1 games"),
-    "too many games": (lambda match: replace(match, games=match.games * 2), "has 4 games"),
-    "sides not rotated": (
-        _change_second_game(lambda game: replace(game, sides=(0, 1))),
-        "game 1 has its sides played by .0, 1., expected .1, 0.",
-    ),
-    "a game of another seed": (_change_second_game(lambda game: replace(game, seed=5)), "game 1 has the seed 5"),
-    "another opening": (_change_second_game(lambda game: replace(game, opening=(0, 1))), "game 1 has another opening"),
-    "a short opening": (_change_second_game(lambda game: replace(game, opening=(1,))), "game 1 has another opening"),
-    "short openings": (
+
+
+def of_game(**changes: Any) -> Callable[[Match], Match]:
+    """Change the second game."""
+    return lambda match: replace(match, games=(match.games[0], replace(match.games[1], **changes)))
+
+
+def of_match(**changes: Any) -> Callable[[Match], Match]:
+    return lambda match: replace(match, **changes)
+
+
+REJECTED: list[tuple[Callable[[Match], Match], str]] = [
+    (of_match(position=9), "ends before position 9"),
+    (of_match(position=-1), "ends before position 9"),
+    (of_match(id="x/1"), "its id is 'x/1'"),
+    (of_match(league="chess"), "its league is 'chess'"),
+    (of_match(contestants=("tictactoe@1", "tictactoe@9")), "its contestants is .*tictactoe@9"),
+    (of_match(contestants=("tictactoe@1", "tictactoe@2")), "its contestants is"),  # others of the schedule
+    (of_match(seed=SCHEDULE.seed_at(2)), "its seed is"),  # of another block
+    (of_match(environment_digest="0" * 64), "its environment_digest is"),
+    (of_match(games=()), "has 0 games, expected 2"),
+    (lambda match: replace(match, games=match.games[:1]), "has 1 games"),
+    (lambda match: replace(match, games=match.games * 2), "has 4 games"),
+    (of_game(sides=(0, 1)), "game 1 has its sides played by .0, 1., expected .1, 0."),
+    (of_game(seed=5), "game 1 has the seed 5"),
+    (of_game(opening=(0, 1)), "game 1 has another opening"),
+    (of_game(opening=(1,)), "game 1 has another opening"),
+    (
         lambda match: replace(match, games=tuple(replace(game, opening=(1,)) for game in match.games)),
         "game 0 has another opening than the block's 2 steps",
     ),
-    "an infinite return": (
-        _change_second_game(lambda game: replace(game, returns=(math.inf, 0.0))),
-        "game 1 needs a finite return",
-    ),
-    "a return too few": (_change_second_game(lambda game: replace(game, returns=(1.0,))), "game 1 needs a finite"),
-    "a return of nobody": (
-        _change_second_game(lambda game: replace(game, returns=(None, 0.25))),
-        "game 1 needs a finite",
-    ),
-    "the other one wins": (
-        _change_second_game(lambda game: replace(game, scores=(1.0, 0.0))),
-        r"returns say \(0\.5, 0\.5\)",
-    ),
-    "both win": (
-        _change_second_game(lambda game: replace(game, scores=(1.0, 1.0))),
-        "game 1 has the scores .* its returns say",
-    ),
-    "a score out of range": (
-        _change_second_game(lambda game: replace(game, scores=(2.0, -1.0))),
-        "game 1 has the scores",
-    ),
-    "a forfeit that wins": (
-        _change_second_game(lambda game: replace(game, forfeits=(CRASH,))),
-        r"forfeits say \(0\.0, 1\.0\)",
-    ),
-    "two forfeits of one": (
-        _change_second_game(lambda game: replace(game, forfeits=(CRASH, CRASH), scores=(0.0, 1.0))),
-        "game 1 has two forfeits",
-    ),
-    "a forfeit of nobody": (
-        _change_second_game(lambda game: replace(game, forfeits=(replace(CRASH, contestant=2),))),
-        "forfeited by contestant 2, which did not play it",
-    ),
-    "a forfeit for no reason": (
-        _change_second_game(lambda game: replace(game, forfeits=(replace(CRASH, reason="tired"),), scores=(0.0, 1.0))),
-        "unknown reason: 'tired'",
-    ),
-    "no number": (_change_second_game(lambda game: replace(game, scores=(math.nan, 1.0))), "game 1 has the scores"),
-}
+    (of_game(returns=(math.inf, 0.0)), "game 1 needs a finite return"),
+    (of_game(returns=(1.0,)), "game 1 needs a finite"),
+    (of_game(returns=(None, 0.25)), "game 1 needs a finite"),
+    (of_game(scores=(1.0, 0.0)), r"returns say \(0\.5, 0\.5\)"),
+    (of_game(scores=(1.0, 1.0)), "game 1 has the scores .* its returns say"),
+    (of_game(scores=(2.0, -1.0)), "game 1 has the scores"),
+    (of_game(scores=(math.nan, 1.0)), "game 1 has the scores"),
+    (of_game(forfeits=(CRASH,)), r"forfeits say \(0\.0, 1\.0\)"),
+    (of_game(forfeits=(CRASH, CRASH), scores=(0.0, 1.0)), "game 1 has two forfeits"),
+    (of_game(forfeits=(replace(CRASH, contestant=2),)), "forfeited by contestant 2, which did not play it"),
+    (of_game(forfeits=(replace(CRASH, reason="tired"),), scores=(0.0, 1.0)), "unknown reason: 'tired'"),
+]
 
 
-@pytest.mark.parametrize("name", REJECTED)
-def test_a_match_that_contradicts_its_schedule_is_rejected(name: str, tmp_path: Path) -> None:
-    change, message = REJECTED[name]
-    registry = registered(Registry.open(Storage.at(tmp_path)))
-    ledger = Ledger(registry)
-    ledger.open(SCHEDULE)
-    with pytest.raises(LedgerConflict, match=message):
-        ledger.append(change(play_match(SCHEDULE, 1)))
-    assert ledger.matches(league=LEAGUE) == []
-    registry.close()
-
-
-def test_a_match_without_a_schedule_is_rejected(ledger: Ledger) -> None:
+def test_a_match_that_contradicts_its_schedule_is_rejected(ledger: Ledger, subtests: pytest.Subtests) -> None:
     with pytest.raises(NotFound, match="there is no schedule 'tictactoe-round_robin-1'"):
         ledger.append(play_match(SCHEDULE, 0))
+    with pytest.raises(UnknownLeague):
+        ledger.open(replace(SCHEDULE, league="chess"))
+    ledger.open(SCHEDULE)
+    for number, (change, message) in enumerate(REJECTED):
+        with subtests.test(number=number, message=message), pytest.raises(LedgerConflict, match=message):
+            ledger.append(change(play_match(SCHEDULE, 1)))
+    assert ledger.matches(league=LEAGUE) == []
 
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
+
+
 boxes = st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), max_size=3)
+
+
 actions = st.one_of(
     st.integers(-(2**63), 2**63 - 1),
     st.lists(st.integers(-(2**63), 2**63 - 1), max_size=3),
@@ -379,17 +280,14 @@ def blocks(draw: Any) -> tuple[Game, ...]:
     )
 
 
-@given(blocks())
-def test_games_survive_serialization(games: tuple[Game, ...]) -> None:
+@given(blocks(), st.integers(0, 2**63 - 1))
+def test_games_and_schedules_survive_serialization(games: tuple[Game, ...], seed: int) -> None:
     assert load_games(dump_games(games)) == games
-
-
-@given(st.integers(0, 2**63 - 1))
-def test_schedules_survive_serialization(seed: int) -> None:
     schedule = replace(SCHEDULE, seed=seed)
     assert load_schedule(dump_schedule(schedule)) == schedule
 
 
+@on_both_databases
 def test_sums_that_differ_from_the_matches_are_found_and_replaced(ledger: Ledger, storage: Storage) -> None:
     ledger.open(SCHEDULE)
     ledger.extend([play_match(SCHEDULE, position) for position in (0, 1, 4)])
@@ -403,3 +301,45 @@ def test_sums_that_differ_from_the_matches_are_found_and_replaced(ledger: Ledger
     assert ledger.recount(SCHEDULE) == []
     assert ledger.sums(LEAGUE, [SCHEDULE]) == before
     assert ledger.counts(LEAGUE) == {SCHEDULE.id: 3}
+
+
+@on_both_databases
+def test_matches_are_stored_once_and_returned_exactly_in_schedule_order(ledger: Ledger) -> None:
+    assert ledger.open(SCHEDULE) == SCHEDULE
+    assert ledger.open(replace(SCHEDULE, length=5)) == SCHEDULE
+    second = replace(SCHEDULE, id="a-later-one")
+    ledger.open(second)
+    assert ledger.schedules(LEAGUE) == [SCHEDULE, second]
+    for position in (4, 0, 2):
+        assert ledger.append(play_match(SCHEDULE, position)) is True
+    match = play_match(SCHEDULE, 4)
+    other_moves = replace(match, games=tuple(replace(game, actions=(8,)) for game in match.games))
+    assert (ledger.append(match), ledger.append(other_moves)) == (False, False)
+    expected = [play_match(SCHEDULE, position) for position in (0, 2, 4)]
+    assert ledger.matches(league=LEAGUE) == expected
+    assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id) == expected
+    assert ledger.matches(league=LEAGUE, schedule="another") == []
+    assert ledger.positions("another") == set()
+    assert ledger.extend([]) == 0
+    assert ledger.extend([play_match(SCHEDULE, position) for position in range(3)]) == 1
+    with pytest.raises(LedgerConflict):
+        ledger.extend([play_match(SCHEDULE, 3), replace(play_match(SCHEDULE, 5), seed=1)])
+    assert ledger.positions(SCHEDULE.id) == {0, 1, 2, 4}, "several are stored together or not at all"
+
+
+def test_a_block_of_solo_games_is_one_comparison(ledger: Ledger) -> None:
+    schedule = replace(SCHEDULE, sides=("team",), scoring="side", opening_plies=0)
+    ledger.open(schedule)
+    played = [solo_match(schedule, 0, 3.5, 2.0), solo_match(schedule, 1, 3.5, 4.0)]
+    ledger.extend(played)
+    won, lost = ledger.matches(league=LEAGUE)
+    assert [won, lost] == played
+    assert (won.score(0), won.score(1), lost.score(0)) == (1.0, 0.0, 0.0)
+    assert (won.mean_return(0), won.mean_return(1)) == (3.5, 2.0)
+    sums = whole(ledger.sums(LEAGUE, [schedule])).values()
+    assert [(of_pair.points, of_pair.played) for of_pair in sums] == [((1.0, 0.0), 1), ((1.0, 0.0), 1)]
+    assert won.result() == BlockResult(schedule.id, 0, won.contestants, 1, (1.0, 0.0), (3.5, 2.0))
+    match = solo_match(schedule, 2, 3.5, 2.0)
+    both = replace(match.games[0], returns=(3.5, 2.0), scores=(1.0, 0.0))
+    with pytest.raises(LedgerConflict, match="finite return of each contestant that played"):
+        ledger.append(replace(match, games=(both, match.games[1])))

@@ -6,40 +6,12 @@ from league.results.records import Scoring
 from league.results.scoring import Values, scores
 
 numbers = st.integers(-3, 3).map(float)
+
+
 pairs = st.tuples(numbers, numbers)
+
+
 scorings: st.SearchStrategy[Scoring] = st.sampled_from(["game", "side"])
-
-
-@pytest.mark.parametrize(
-    ("returns", "scoring", "expected"),
-    [
-        ([(1.0, -1.0), (0.0, 0.0)], "game", [(1.0, 0.0), (0.5, 0.5)]),
-        ([(3.0, 5.0), (5.0, 3.0)], "game", [(0.0, 1.0), (1.0, 0.0)]),
-        # Contestant 0 is the better adversary (-1 against -2), and equally good against the adversary.
-        ([(-1.0, 4.0), (4.0, -2.0)], "side", [(1.0, 0.5), (0.5, 0.0)]),
-        ([(7.0, None), (None, 6.5)], "side", [(1.0, None), (None, 0.0)]),
-        ([(7.0, None), (None, 7.0)], "side", [(0.5, None), (None, 0.5)]),
-    ],
-)
-def test_scores_follow_the_returns(returns: list[Values], scoring: Scoring, expected: list[Values]) -> None:
-    assert scores(returns, scoring) == expected
-
-
-@pytest.mark.parametrize(
-    ("returns", "scoring", "forfeits", "expected"),
-    [
-        ([(9.0, -9.0), (0.0, 0.0)], "game", [{0}, set()], [(0.0, 1.0), (0.5, 0.5)]),
-        ([(9.0, -9.0), (0.0, 1.0)], "game", [{0, 1}, {1}], [(0.5, 0.5), (1.0, 0.0)]),
-        ([(9.0, -9.0), (9.0, -9.0)], "side", [{0}, set()], [(0.0, 1.0), (0.0, 1.0)]),
-        ([(9.0, -9.0), (9.0, -9.0)], "side", [{0}, {1}], [(0.5, 0.5), (0.5, 0.5)]),
-        ([(9.0, None), (None, 6.5)], "side", [{0}, set()], [(0.0, None), (None, 1.0)]),
-        ([(9.0, None), (None, 6.5)], "side", [{0}, {1}], [(0.5, None), (None, 0.5)]),
-    ],
-)
-def test_a_forfeit_loses_whatever_the_return(
-    returns: list[Values], scoring: Scoring, forfeits: list[set[int]], expected: list[Values]
-) -> None:
-    assert scores(returns, scoring, forfeits) == expected
 
 
 forfeit_sets = st.tuples(*[st.sets(st.sampled_from([0, 1]))] * 2)
@@ -72,3 +44,23 @@ def test_a_forfeit_never_increases_the_score(
     before = scores(returns, scoring, forfeits)
     after = scores([collected, returns[1]], scoring, [forfeits[0] | {by}, forfeits[1]])
     assert sum(game[by] or 0.0 for game in after) <= sum(game[by] or 0.0 for game in before)
+
+
+def test_scores_follow_the_returns_and_forfeits(subtests: pytest.Subtests) -> None:
+    for returns, scoring, forfeits, expected in (
+        ([(1.0, -1.0), (0.0, 0.0)], "game", None, [(1.0, 0.0), (0.5, 0.5)]),
+        ([(3.0, 5.0), (5.0, 3.0)], "game", None, [(0.0, 1.0), (1.0, 0.0)]),
+        # Contestant 0 is the better adversary (-1 against -2), and equally good against the adversary.
+        ([(-1.0, 4.0), (4.0, -2.0)], "side", None, [(1.0, 0.5), (0.5, 0.0)]),
+        ([(7.0, None), (None, 6.5)], "side", None, [(1.0, None), (None, 0.0)]),
+        ([(7.0, None), (None, 7.0)], "side", None, [(0.5, None), (None, 0.5)]),
+        # A forfeit loses whatever the return.
+        ([(9.0, -9.0), (0.0, 0.0)], "game", [{0}, set()], [(0.0, 1.0), (0.5, 0.5)]),
+        ([(9.0, -9.0), (0.0, 1.0)], "game", [{0, 1}, {1}], [(0.5, 0.5), (1.0, 0.0)]),
+        ([(9.0, -9.0), (9.0, -9.0)], "side", [{0}, set()], [(0.0, 1.0), (0.0, 1.0)]),
+        ([(9.0, -9.0), (9.0, -9.0)], "side", [{0}, {1}], [(0.5, 0.5), (0.5, 0.5)]),
+        ([(9.0, None), (None, 6.5)], "side", [{0}, set()], [(0.0, None), (None, 1.0)]),
+        ([(9.0, None), (None, 6.5)], "side", [{0}, {1}], [(0.5, None), (None, 0.5)]),
+    ):
+        with subtests.test(returns=returns, forfeits=forfeits):
+            assert scores(returns, scoring, *([] if forfeits is None else [forfeits])) == expected

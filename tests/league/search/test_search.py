@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from itertools import product
 from random import Random
 
 import numpy as np
@@ -22,6 +23,8 @@ from league.search.tree import LEAVES, Estimates, Nodes, Rule, Search, SearchRes
 from league.spaces import ACTION_MASK, OBSERVATION
 
 RULES: dict[str, Callable[[], Rule]] = {"PUCT": PUCT, "sequential halving": SequentialHalving}
+
+
 ACTIONS = {TicTacToe: 9, ConnectFour: 7}
 
 
@@ -58,47 +61,6 @@ def searched(
     return search.run(rows, rng)
 
 
-def positions(env: VectorEnv, copies: NDArray[np.int64], games: Sequence[Sequence[int]]) -> AgentRows:
-    rows = env.reset(copies, np.zeros(len(copies), dtype=np.int64))[0]
-    for copy, actions in zip(copies, games, strict=True):
-        for action in actions:
-            (row,) = env.step(np.array([copy]), np.array([action]))
-            assert not row.has_ended.any(), "a position in which a player must move"
-            place = rows.envs == copy
-            for name, observation in row.observations.items():
-                rows.observations[name][place] = observation
-            rows.agents[place] = row.agents
-    return rows
-
-
-@pytest.fixture(params=RULES)
-def rule_name(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-def test_a_mate_in_one_is_played(rule_name: str) -> None:
-    result = searched(TicTacToe, [(0, 3, 1, 4), (0, 3, 1, 4, 8)], RULES[rule_name](), 50)
-    assert result.actions.tolist() == [2, 5]
-    assert (result.values > 0).all()
-
-
-def test_the_value_of_a_finished_game_is_exact(rule_name: str) -> None:
-    """The only legal move wins, or draws. The position itself was evaluated as 0."""
-    result = searched(TicTacToe, [(0, 1, 2, 4, 5, 3, 7, 6), (0, 1, 2, 4, 7, 3, 5, 8)], RULES[rule_name](), 49)
-    assert result.actions.tolist() == [8, 6]
-    assert result.values.tolist() == [np.float32(49 / 50), 0]
-
-
-def test_a_threat_is_parried_in_connect_four(rule_name: str) -> None:
-    assert searched(ConnectFour, [(0, 6, 0, 6, 0), (3, 0, 3, 1, 3)], RULES[rule_name](), 200).actions.tolist() == [0, 3]
-
-
-def test_a_mate_in_two_is_played(rule_name: str) -> None:
-    """Tic-tac-toe: a fork. Connect four: three in the bottom row with both ends open."""
-    assert searched(TicTacToe, [(0, 1, 3, 6)], RULES[rule_name](), 400).actions[0] in (4,)
-    assert searched(ConnectFour, [(2, 2, 3, 3)], RULES[rule_name](), 1000).actions[0] in (1, 4)
-
-
 games_of_connect_four = st.lists(st.lists(st.integers(0, 6), max_size=6), min_size=1, max_size=5)
 
 
@@ -133,16 +95,6 @@ def test_the_result_of_a_game_depends_neither_on_the_others_nor_on_their_order(
     assert (alone.logits == together.logits[:1]).all()
 
 
-def test_a_search_can_be_repeated_and_its_nodes_reused(rule_name: str) -> None:
-    search = Search(ConnectFour, hashed, RULES[rule_name](), games=2, simulations=60, num_actions=7)
-    first = search.run([positions(search.env, search.roots, [(3, 3), (0,)])])
-    other = search.run([positions(search.env, search.roots[:1], [(6, 5, 4)])])
-    again = search.run([positions(search.env, search.roots, [(3, 3), (0,)])])
-    assert (first.visits == again.visits).all()
-    assert (first.values == again.values).all()
-    assert (other.visits == searched(ConnectFour, [(6, 5, 4)], RULES[rule_name](), 60, hashed).visits).all()
-
-
 @pytest.mark.slow
 def test_tictactoe_is_never_lost_against_the_solver() -> None:
     """The opponent tries every move that keeps the best outcome, from both sides."""
@@ -160,26 +112,6 @@ def test_tictactoe_is_never_lost_against_the_solver() -> None:
             answers = [(*moved, answer) for answer, outcome in outcomes.items() if outcome == max(outcomes.values())]
             following += [answer for answer in answers if not played(TicTacToe, answer).has_ended.any()]
         games = following
-
-
-def played(game: type[TicTacToe] | type[ConnectFour], actions: Sequence[int]) -> AgentRows:
-    env, copy = game(1), np.array([0])
-    rows = env.reset(copy, copy)[0]
-    for action in actions:
-        (rows,) = env.step(copy, np.array([action]))
-    return rows
-
-
-@pytest.mark.parametrize("noise", [False, True])
-@pytest.mark.parametrize(("considered", "simulations"), [(7, 12), (7, 32), (7, 100), (6, 41)])
-@pytest.mark.parametrize("leaves", [1, LEAVES])
-def test_sequential_halving_equals_a_plain_search(noise: bool, considered: int, simulations: int, leaves: int) -> None:
-    game = (0,) * 6 if considered == 6 else (3, 2)
-    result = searched(ConnectFour, [game], SequentialHalving(), simulations, hashed, 1 if noise else None, leaves)
-    gumbel = np.random.default_rng([1, *game]).gumbel(size=7) if noise else np.zeros(7)
-    visits, action = plain_search(game, simulations, gumbel, leaves)
-    assert result.visits[0].tolist() == visits
-    assert result.actions[0] == action
 
 
 class PlainNode:
@@ -306,3 +238,67 @@ def test_puct_equals_a_plain_search(game: tuple[int, ...], simulations: int, lea
     result = searched(ConnectFour, [game], PUCT(), simulations, hashed, leaves=leaves)
     assert result.visits[0].tolist() == [len(root.returns.get(action, ())) for action in range(7)]
     assert max(sizes) == min(leaves, simulations // 4)
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
+def test_tactics_are_found_and_values_of_finished_games_are_exact(rule: Callable[[], Rule]) -> None:
+    for game, moves, simulations, answers in (
+        (TicTacToe, (0, 3, 1, 4), 50, [2]),  # wins
+        (TicTacToe, (0, 3, 1, 4, 8), 50, [5]),
+        (TicTacToe, (0, 1, 3, 6), 400, [4]),  # a fork
+        (ConnectFour, (0, 6, 0, 6, 0), 200, [0]),
+        (ConnectFour, (3, 0, 3, 1, 3), 200, [3]),  # parries a threat
+        (ConnectFour, (2, 2, 3, 3), 1000, [1, 4]),  # three in the bottom row with both ends open
+    ):
+        assert searched(game, [moves], rule(), simulations).actions[0] in answers
+    # The only legal move wins, or draws. The position itself was evaluated as 0.
+    result = searched(TicTacToe, [(0, 1, 2, 4, 5, 3, 7, 6), (0, 1, 2, 4, 7, 3, 5, 8)], rule(), 49)
+    assert result.actions.tolist() == [8, 6]
+    assert result.values.tolist() == [np.float32(49 / 50), 0]
+
+
+def played(game: type[TicTacToe] | type[ConnectFour], actions: Sequence[int]) -> AgentRows:
+    return positions(game(1), np.array([0]), [actions], is_open=False)
+
+
+def positions(
+    env: VectorEnv, copies: NDArray[np.int64], games: Sequence[Sequence[int]], is_open: bool = True
+) -> AgentRows:
+    rows = env.reset(copies, np.zeros(len(copies), dtype=np.int64))[0]
+    for copy, actions in zip(copies, games, strict=True):
+        for action in actions:
+            (row,) = env.step(np.array([copy]), np.array([action]))
+            if not is_open:
+                rows = row
+                continue
+            assert not row.has_ended.any(), "a position in which a player must move"
+            place = rows.envs == copy
+            for name, observation in row.observations.items():
+                rows.observations[name][place] = observation
+            rows.agents[place] = row.agents
+    return rows
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
+def test_a_search_can_be_repeated_and_its_nodes_reused(rule: Callable[[], Rule]) -> None:
+    search = Search(ConnectFour, hashed, rule(), games=2, simulations=60, num_actions=7)
+    first = search.run([positions(search.env, search.roots, [(3, 3), (0,)])])
+    other = search.run([positions(search.env, search.roots[:1], [(6, 5, 4)])])
+    again = search.run([positions(search.env, search.roots, [(3, 3), (0,)])])
+    assert (first.visits == again.visits).all()
+    assert (first.values == again.values).all()
+    assert (other.visits == searched(ConnectFour, [(6, 5, 4)], rule(), 60, hashed).visits).all()
+
+
+def test_sequential_halving_equals_a_plain_search(subtests: pytest.Subtests) -> None:
+    for noise, (game, simulations), leaves in product(
+        (False, True), (((3, 2), 12), ((3, 2), 32), ((3, 2), 100), ((0,) * 6, 41)), (1, LEAVES)
+    ):
+        with subtests.test(noise=noise, simulations=simulations, leaves=leaves):
+            result = searched(
+                ConnectFour, [game], SequentialHalving(), simulations, hashed, 1 if noise else None, leaves
+            )
+            gumbel = np.random.default_rng([1, *game]).gumbel(size=7) if noise else np.zeros(7)
+            visits, action = plain_search(game, simulations, gumbel, leaves)
+            assert result.visits[0].tolist() == visits
+            assert result.actions[0] == action

@@ -20,9 +20,12 @@ from league.spaces.binary_leaves import MAX_DECODED_BYTES, SIGNATURE, check_deco
 from tests.support.examples import examples
 from tests.support.pictures import MODES, png
 
-DTYPES = (
-    ["bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64"]
-)  # fmt: skip
+DTYPES = [f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)] + [
+    "bool",
+    "float16",
+    "float32",
+    "float64",
+]
 
 
 def leaf(shape: tuple[int, ...], dtype: str = "uint8") -> Leaf:
@@ -43,9 +46,6 @@ def head(height: int, width: int, bits: int = 8, colour: int = 0, interlace: int
 
 anything = st.sampled_from(DTYPES).flatmap(
     lambda dtype: arrays(dtype, array_shapes(min_dims=0, max_dims=3, max_side=4))
-)
-image_arrays = st.tuples(st.integers(1, 6), st.integers(1, 6), st.sampled_from(list(MODES))).flatmap(
-    lambda shape: arrays(np.uint8, shape)
 )
 
 
@@ -70,6 +70,8 @@ def deep(depth: int) -> Any:
 
 
 EIGHT = b64(np.arange(2, dtype="<f4").tobytes())
+
+
 BAD_ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
     "another dtype": ({"b64": EIGHT, "dtype": "float64"}, "has dtype 'float64', expected float32"),
     "another order": ({"b64": EIGHT, "dtype": ">f4"}, "has dtype '>f4'"),
@@ -93,41 +95,12 @@ BAD_ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_ARRAYS)
-def test_an_invalid_array_is_rejected(name: str) -> None:
-    value, message = BAD_ARRAYS[name]
-    with pytest.raises(ObservationError) as error:
-        decode("observation.speed", value, leaf((2,), "float32"))
-    assert str(error.value).startswith("observation.speed")
-    assert message in str(error.value)
-    assert len(str(error.value)) < 300
-
-
-def test_bytes_of_a_boolean_are_0_and_1() -> None:
-    with pytest.raises(ObservationError, match="bytes other than 0 and 1"):
-        decode("mask", {"b64": b64(b"\0\1\2")}, leaf((3,), "bool"))
-
-
-@given(pixels=image_arrays)
-def test_an_image_survives_encoding(pixels: NDArray) -> None:
-    read = decode("observation", {"png": b64(png(pixels))}, leaf(pixels.shape))
-    assert (read.dtype, read.tolist()) == (np.uint8, pixels.tolist())
-
-
-def test_a_grey_image_needs_no_channel_axis() -> None:
-    pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    assert decode("observation", {"png": b64(png(pixels))}, leaf((3, 4))).tolist() == pixels.tolist()
-
-
-@given(stack=st.lists(st.sampled_from(list(MODES)), min_size=1, max_size=5), data=st.data())
-def test_several_images_are_stacked_along_the_last_axis(stack: list[int], data: st.DataObject) -> None:
-    parts = [data.draw(arrays(np.uint8, (3, 2, values))) for values in stack]
-    read = decode("observation", {"png": [b64(png(part)) for part in parts]}, leaf((3, 2, sum(stack))))
-    assert read.tolist() == np.concatenate(parts, axis=2).tolist()
-
-
 GREY = np.arange(12, dtype=np.uint8).reshape(3, 4)
+
+
 GOOD = png(GREY)
+
+
 BAD_PICTURES: dict[str, tuple[Any, str]] = {
     "not valid base64": ("*", "not valid base64"),
     "not a string": (3, "not a string"),
@@ -151,58 +124,6 @@ BAD_PICTURES: dict[str, tuple[Any, str]] = {
     "pixels of another kind": (b64(GOOD.replace(b"IDAT", b"iDAT")), "cannot be decoded"),
     "damaged": (b64(GOOD.replace(head(3, 4), head(3, 4)[:-1] + b"\0")), "cannot be decoded"),
 }
-
-
-@pytest.mark.parametrize("name", BAD_PICTURES)
-def test_an_invalid_image_is_rejected(name: str) -> None:
-    value, message = BAD_PICTURES[name]
-    with pytest.raises(ObservationError) as error:
-        decode("observation.screen", {"png": value}, leaf((3, 4)))
-    assert str(error.value).startswith("observation.screen")
-    assert message in str(error.value)
-
-
-@pytest.mark.parametrize("other", [leaf((3, 4), "float32"), leaf((12,)), leaf((3, 4, 1, 1)), leaf((), "uint8")])
-def test_only_image_leaves_can_be_sent_as_png(other: Leaf) -> None:
-    with pytest.raises(ObservationError, match="which png cannot encode"):
-        decode("observation", {"png": b64(GOOD)}, other)
-
-
-def test_an_image_takes_no_other_keys() -> None:
-    with pytest.raises(ObservationError, match="unknown key 'shape'"):
-        decode("observation", {"png": b64(GOOD), "shape": [3, 4]}, leaf((3, 4)))
-
-
-def test_an_interlaced_image_is_decoded() -> None:
-    """One pixel is the first pass of Adam7 only."""
-    pixels = zlib.compress(b"\0\x2a")
-    image = SIGNATURE + head(1, 1, interlace=1) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
-    assert decode("observation", {"png": b64(image)}, leaf((1, 1))).tolist() == [[42]]
-
-
-def test_text_and_profile_chunks_are_ignored() -> None:
-    """Pillow decompresses them, and rejects images with large ones."""
-    text = PngImagePlugin.PngInfo()
-    text.add_text("comment", "x" * 50_000_000, zip=True)
-    image = png(GREY, pnginfo=text)
-    profile = chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(50_000_000)))
-    end = image.index(b"IDAT") - 4
-    image = image[:end] + profile + image[end:]
-    assert decode("observation", {"png": b64(image)}, leaf((3, 4))).tolist() == GREY.tolist()
-
-
-def test_transparency_and_gamma_do_not_change_pixels() -> None:
-    end = GOOD.index(b"IDAT") - 4
-    for extra in (chunk(b"tRNS", b"\0\1"), chunk(b"gAMA", struct.pack(">I", 1)), chunk(b"acTL", bytes(8))):
-        image = GOOD[:end] + extra + GOOD[end:]
-        assert decode("observation", {"png": b64(image)}, leaf((3, 4))).tolist() == GREY.tolist()
-
-
-@pytest.mark.parametrize("side", [12_000, 60_000])
-def test_a_second_header_does_not_enlarge_an_image(side: int) -> None:
-    """Pillow uses the last header, which would allocate hundreds of megabytes or fail with its own error."""
-    image = SIGNATURE + head(3, 4) + head(side, side) + GOOD[GOOD.index(b"IDAT") - 4 :]
-    assert decode("observation", {"png": b64(image)}, leaf((3, 4))).tolist() == GREY.tolist()
 
 
 def test_the_decoded_size_of_images_is_limited() -> None:
@@ -240,3 +161,66 @@ def test_chunks_in_any_order_are_rejected_or_decoded(chunks: list[tuple[bytes, b
     image = SIGNATURE + head(2, 2) + b"".join(chunk(*each) for each in chunks)
     with suppress(ObservationError):
         assert decode("observation", {"png": b64(image)}, leaf((2, 2))).shape == (2, 2)
+
+
+def test_an_invalid_array_is_rejected(subtests: pytest.Subtests) -> None:
+    for name, (value, message) in BAD_ARRAYS.items():
+        with subtests.test(name):
+            with pytest.raises(ObservationError) as error:
+                decode("observation.speed", value, leaf((2,), "float32"))
+            text = str(error.value)
+            assert text.startswith("observation.speed")
+            assert message in text
+            assert len(text) < 300
+    with pytest.raises(ObservationError, match="bytes other than 0 and 1"):
+        decode("mask", {"b64": b64(b"\0\1\2")}, leaf((3,), "bool"))
+
+
+@given(stack=st.lists(st.sampled_from(list(MODES)), min_size=1, max_size=5), data=st.data())
+def test_images_survive_encoding_and_are_stacked_along_the_last_axis(stack: list[int], data: st.DataObject) -> None:
+    height, width = data.draw(st.tuples(st.integers(1, 6), st.integers(1, 6)))
+    parts = [data.draw(arrays(np.uint8, (height, width, values))) for values in stack]
+    images = [b64(png(part)) for part in parts]
+    read = decode("observation", {"png": images[0] if len(images) == 1 else images}, leaf((height, width, sum(stack))))
+    assert (read.dtype, read.tolist()) == (np.uint8, np.concatenate(parts, axis=2).tolist())
+
+
+def read_grey(image: bytes, shape: tuple[int, ...] = (3, 4)) -> Any:
+    return decode("observation", {"png": b64(image)}, leaf(shape)).tolist()
+
+
+def test_an_invalid_image_is_rejected(subtests: pytest.Subtests) -> None:
+    for name, (value, message) in BAD_PICTURES.items():
+        with subtests.test(name):
+            with pytest.raises(ObservationError) as error:
+                decode("observation.screen", {"png": value}, leaf((3, 4)))
+            text = str(error.value)
+            assert text.startswith("observation.screen")
+            assert message in text
+    for other in (leaf((3, 4), "float32"), leaf((12,)), leaf((3, 4, 1, 1)), leaf((), "uint8")):
+        with pytest.raises(ObservationError, match="which png cannot encode"):
+            decode("observation", {"png": b64(GOOD)}, other)
+    with pytest.raises(ObservationError, match="unknown key 'shape'"):
+        decode("observation", {"png": b64(GOOD), "shape": [3, 4]}, leaf((3, 4)))
+
+
+def test_other_chunks_do_not_change_pixels() -> None:
+    """Pillow decompresses texts and profiles, and rejects images with large ones. It uses the last header, which would
+    allocate hundreds of megabytes or fail with its own error.
+    """
+    assert read_grey(GOOD) == GREY.tolist(), "no channel axis is needed"
+    text = PngImagePlugin.PngInfo()
+    text.add_text("comment", "x" * 50_000_000, zip=True)
+    for image, extra in (
+        (png(GREY, pnginfo=text), chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(50_000_000)))),
+        (GOOD, chunk(b"tRNS", b"\0\1")),
+        (GOOD, chunk(b"gAMA", struct.pack(">I", 1))),
+        (GOOD, chunk(b"acTL", bytes(8))),
+        (GOOD, head(12_000, 12_000)),
+        (GOOD, head(60_000, 60_000)),
+    ):
+        end = image.index(b"IDAT") - 4
+        assert read_grey(image[:end] + extra + image[end:]) == GREY.tolist()
+    # Interlaced: one pixel is the first pass of Adam7 only.
+    pixels = chunk(b"IDAT", zlib.compress(b"\0\x2a")) + chunk(b"IEND", b"")
+    assert read_grey(SIGNATURE + head(1, 1, interlace=1) + pixels, (1, 1)) == [[42]]

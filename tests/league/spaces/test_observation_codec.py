@@ -15,8 +15,14 @@ from league.spaces.arrays import tensors
 from league.spaces.observation_codec import ObservationReader, read_state, reject_strings
 
 GRID = Box(dtype="uint8", shape=(2, 3), low=0, high=255)
+
+
 SPEED = Box(dtype="float32", shape=(2,), low=None, high=None)
+
+
 MASK = Box(dtype="int8", shape=(3,), low=0, high=1)
+
+
 SPACES: dict[str, Space] = {
     "leaf": GRID,
     "masked": DictSpace(spaces={"action_mask": MASK, "observation": GRID}),
@@ -57,22 +63,6 @@ def test_observations_survive_json(space: Space, data: st.DataObject) -> None:
         np.testing.assert_array_equal(array, np.stack([row[name] for row in expected]))
 
 
-@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
-def test_zeros_are_valid_observations(space: Space) -> None:
-    reader = ObservationReader(space)
-    zeros = reader.zeros(2)
-    assert {array.shape[0] for array in zeros.values()} == {2}
-    if "action_mask" in zeros:
-        assert zeros["action_mask"].all()
-
-
-@pytest.mark.parametrize(
-    ("space", "keys"), [("leaf", 0), ("masked", 2), ("masked and nested", 4), ("nested", 4)], ids=lambda v: str(v)
-)
-def test_keys_counts_the_keys_of_an_observation(space: str, keys: int) -> None:
-    assert ObservationReader(SPACES[space]).keys == keys
-
-
 def test_nested_strings_are_found() -> None:
     reject_strings({"a": [1, [2.5, None, {"b": True}]]})
     with pytest.raises(ObservationError, match="'deep'"):
@@ -85,3 +75,12 @@ def test_state_has_a_row_for_each_observation() -> None:
     for invalid in (None, {}, {"state_in_0": [[1, 2]]}, {"state_in_0": [1, 2]}, {"state_in_1": [[1, 2]] * 2}):
         with pytest.raises(ObservationError, match="state"):
             read_state(invalid, leaves, 2)
+
+
+def test_zeros_are_valid_observations_and_keys_are_counted() -> None:
+    for name, keys in {"leaf": 0, "masked": 2, "masked and nested": 4, "nested": 4}.items():
+        reader = ObservationReader(SPACES[name])
+        assert reader.keys == keys
+        zeros = reader.zeros(2)
+        assert {array.shape[0] for array in zeros.values()} == {2}
+        assert zeros.get("action_mask", np.ones(1)).all()

@@ -20,7 +20,9 @@ class VectorCopies(VectorEnv):
     entry_point: str
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
-        config = EnvironmentConfig(entry_point=self.entry_point, kwargs=kwargs)
+        self._create(EnvironmentConfig(entry_point=self.entry_point, kwargs=kwargs), num_envs)
+
+    def _create(self, config: EnvironmentConfig, num_envs: int) -> None:
         envs = [build(config) for _ in range(num_envs)]
         self.num_envs, self.possible_agents = num_envs, tuple(envs[0].possible_agents)
         spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.possible_agents]
@@ -33,10 +35,10 @@ class VectorCopies(VectorEnv):
         return self._rows({env: self._copies[env].reset(seed) for env, seed in starting})
 
     def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
-        coming = iter(actions.tolist())
+        coming = iter(actions.tolist() if actions.ndim == 1 else list(actions))
         reports = {}
         for env in env_ids.tolist():
-            reports[env] = self._copies[env].step([(agent, next(coming)) for agent in self._acting[env]])
+            reports[env] = self._copies[env].step([(agent, next(coming)) for agent in sorted(self._acting[env])])
         assert next(coming, None) is None, "more actions than agents"
         return self._rows(reports)
 
@@ -65,6 +67,13 @@ class VectorCopies(VectorEnv):
             np.array([report[3] for _, report in rows], bool),
             np.array([report[4] for _, report in rows], bool),
         )
+
+
+class Looped(VectorCopies):
+    """Copies of any environment."""
+
+    def __init__(self, config: EnvironmentConfig, num_envs: int) -> None:
+        self._create(config, num_envs)
 
 
 class VectorMeeting(VectorCopies):

@@ -37,7 +37,10 @@ from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, 
 from tests.support.simulators import LEAGUE, NAME, VERSION, external, gateway, pettingzoo, simulating, stepping
 
 BOARD = {"observation": np.zeros((3, 3, 2), np.int8), "action_mask": np.ones(9, np.int8)}
+
+
 FIRST = Report("player_1", BOARD)
+
 
 InThread = Callable[[Callable[[], object]], threading.Thread]
 
@@ -132,15 +135,32 @@ def ends_without_an_action(door: Gateway) -> None:
     until_refused(opened)
 
 
-def ends_without_last_reports(door: Gateway) -> None:
-    opened, (first, *_) = started(door)
-    opened.report([(first, FIRST), (first, FIRST._replace(agent="player_2"))])
+STOCK = pettingzoo(importlib.import_module(CONFIG.environment.entry_point).env)
+
+
+def first_legal(turn: Turn) -> dict[int, np.ndarray]:
+    return {group: batch.observations["action_mask"].argmax(axis=1) for group, batch in turn.batches.items()}
+
+
+def until_both_act(opened: SimulatorConnection, episode: int) -> None:
+    opened.report([(episode, FIRST), (episode, FIRST._replace(agent="player_2"))])
     acted = 0
     while acted < 2:
         event = opened.receive()
         acted += len(event.agents) if isinstance(event, ActionRows) else 0
-    rows = 0, np.array([first]), np.array([0]), np.array([1.0]), np.array([TERMINATED | OVER])
-    opened.report_rows(ReportBlock(*rows, [BOARD["observation"][np.newaxis], BOARD["action_mask"][np.newaxis]]))
+
+
+def last_reports(opened: SimulatorConnection, episode: int, agents: int) -> None:
+    """Of the first agents, each of which says that the episode is over."""
+    board = [np.stack([BOARD[name]] * agents) for name in ("observation", "action_mask")]
+    flags = np.full(agents, TERMINATED | OVER)
+    opened.report_rows(ReportBlock(0, np.full(agents, episode), np.arange(agents), np.ones(agents), flags, board))
+
+
+def ends_without_last_reports(door: Gateway) -> None:
+    opened, (first, *_) = started(door)
+    until_both_act(opened, first)
+    last_reports(opened, first, 1)
     until_refused(opened)
 
 
@@ -170,6 +190,41 @@ def sends_no_greeting(door: Gateway) -> None:
         socket.send("{" * 1000)
         while True:
             socket.recv(60)
+
+
+def test_a_simulator_with_a_loop_of_its_own(
+    opened: Registry, environment: BatchedEnvironment, in_thread: InThread
+) -> None:
+    seeds: list[int] = []
+
+    def run() -> None:
+        door = gateway(opened)
+        simulator = Simulator(door.url, LEAGUE, name=NAME, version=VERSION, key=door.token, binary=False)
+        for episode in itertools.islice(simulator.episodes(), 3):
+            seeds.append(episode.seed)
+            action = episode.act(FIRST)["player_1"]
+            if len(seeds) == 2:
+                continue  # without an end: the episode is abandoned
+            episode.end(FIRST._replace(reward=float(action), terminated=True))
+
+    in_thread(run)
+    turn = environment.start(each_agent_alone([3, 4, 5], 2))
+    returns, crashed = [], 0
+    while turn.batches or len(turn.crashed):
+        crashed += len(turn.crashed)
+        turn = environment.step({group: np.full(len(batch), 7) for group, batch in turn.batches.items()})
+        returns += [ending.reward for ending in turn.each_ending()]
+    assert (returns, crashed, seeds) == ([7.0, 7.0], 1, [3, 4, 5])
+
+
+def plays_on(door: Gateway) -> None:
+    """Play episodes until the connection is closed. Both agents act at once, and both say that the episode is over."""
+    simulator = connection(door, episodes=1)
+    while True:
+        event = simulator.receive()
+        if isinstance(event, Play):
+            until_both_act(simulator, event.episodes[0])
+            last_reports(simulator, event.episodes[0], 2)
 
 
 ATTACKS: list[Callable[[Gateway], None]] = [
@@ -204,91 +259,33 @@ def test_hostile_simulators_are_refused_and_change_nothing(
                 refusals[hostile.__name__] = str(error)
 
     attacker = in_thread(attack)
-    with simulating(opened, pettingzoo(importlib.import_module(CONFIG.environment.entry_point).env), episodes=2):
+    with simulating(opened, STOCK, episodes=2):
         while attacker.is_alive():
             assert play_matches(schedule, positions, environment, INTERFACE, build_roster()) == expected
     assert refusals.keys() == {attack.__name__ for attack in ATTACKS}
-    assert "not one of this simulator" in refusals["reports_on_another_simulator"]
-    assert "reports twice" in refusals["reports_twice"]
-    assert "before anybody has acted" in refusals["ends_without_an_action"]
-    assert "has no last report" in refusals["ends_without_last_reports"]
-    assert "finite" in refusals["reports_nan"]
-    assert "expects 'game' of version '1.2'" in refusals["has_another_version"]
-    assert "401" in refusals["has_another_token"]
+    for name, reason in {
+        "reports_on_another_simulator": "not one of this simulator",
+        "reports_twice": "reports twice",
+        "ends_without_an_action": "before anybody has acted",
+        "ends_without_last_reports": "has no last report",
+        "reports_nan": "finite",
+        "has_another_version": "expects 'game' of version '1.2'",
+        "has_another_token": "401",
+    }.items():
+        assert reason in refusals[name]
 
 
 def test_a_slow_simulator_delays_nobody(opened: Registry, environment: BatchedEnvironment, in_thread: InThread) -> None:
     """Turns contain what has been reported, while an episode of another simulator waits for its report."""
-    turns = []
-    with simulating(opened, pettingzoo(importlib.import_module(CONFIG.environment.entry_point).env), episodes=7):
-
-        def next_turns() -> None:
-            turn = environment.start(each_agent_alone(range(10_000), 2))
-            while len(turns) < 50:
-                turns.append(turn)
-                acts = {
-                    group: batch.observations["action_mask"].argmax(axis=1) for group, batch in turn.batches.items()
-                }
-                turn = environment.step(acts)
-
+    acting = []
+    with simulating(opened, STOCK, episodes=7):
         in_thread(lambda: started(gateway(opened)))
-        next_turns()
-    acting = [set(np.flatnonzero(turn.acting(8))) for turn in turns]
+        turn = environment.start(each_agent_alone(range(10_000), 2))
+        while len(acting) < 50:
+            acting.append(set(np.flatnonzero(turn.acting(8))))
+            turn = environment.step(first_legal(turn))
     assert any(len(envs) < 8 for envs in acting)
     assert len(set().union(*acting)) >= 6
-
-
-def test_a_simulator_with_a_loop_of_its_own(
-    opened: Registry, environment: BatchedEnvironment, in_thread: InThread
-) -> None:
-    seeds: list[int] = []
-
-    def run() -> None:
-        door = gateway(opened)
-        simulator = Simulator(door.url, LEAGUE, name=NAME, version=VERSION, key=door.token, binary=False)
-        for episode in itertools.islice(simulator.episodes(), 3):
-            seeds.append(episode.seed)
-            action = episode.act(FIRST)["player_1"]
-            if len(seeds) == 2:
-                continue  # without an end: the episode is abandoned
-            episode.end(FIRST._replace(reward=float(action), terminated=True))
-
-    in_thread(run)
-    turn = environment.start(each_agent_alone([3, 4, 5], 2))
-    returns, crashed = [], 0
-    while turn.batches or len(turn.crashed):
-        crashed += len(turn.crashed)
-        turn = environment.step({group: np.full(len(batch), 7) for group, batch in turn.batches.items()})
-        returns += [ending.reward for ending in turn.each_ending()]
-    assert (returns, crashed, seeds) == ([7.0, 7.0], 1, [3, 4, 5])
-
-
-def ends_twice(opened: SimulatorConnection, episode: int) -> None:
-    """Both agents act at once, and both last reports say that the episode is over."""
-    opened.report([(episode, FIRST), (episode, FIRST._replace(agent="player_2"))])
-    acted = 0
-    while acted < 2:
-        event = opened.receive()
-        acted += len(event.agents) if isinstance(event, ActionRows) else 0
-    board = [np.stack([BOARD[name]] * 2) for name in ("observation", "action_mask")]
-    flags = np.full(2, TERMINATED | OVER)
-    opened.report_rows(ReportBlock(0, np.full(2, episode), np.arange(2), np.ones(2), flags, board))
-
-
-def plays_on(door: Gateway) -> None:
-    """Play episodes until the connection is closed."""
-    simulator = connection(door, episodes=1)
-    while True:
-        event = simulator.receive()
-        if isinstance(event, Play):
-            ends_twice(simulator, event.episodes[0])
-
-
-def test_each_last_report_may_say_that_the_episode_is_over(
-    opened: Registry, environment: BatchedEnvironment, in_thread: InThread
-) -> None:
-    in_thread(lambda: plays_on(gateway(opened)))
-    assert play_out(environment, 5) == ([1.0] * 10, 0)
 
 
 def test_a_simulator_that_leaves_before_anybody_acts_costs_nothing(
@@ -306,6 +303,7 @@ def test_a_simulator_that_leaves_before_anybody_acts_costs_nothing(
     in_thread(run)
     rewards, lost = play_out(environment, 3)
     assert len(rewards) == 2 * (3 - lost), "its episode is lost only if its reports were in a turn"
+    assert play_out(environment, 5) == ([1.0] * 10, 0), "each last report may say that the episode is over"
 
 
 @pytest.mark.parametrize("opened", [0.3], indirect=True)
@@ -322,13 +320,29 @@ def test_a_simulator_that_hangs_beside_a_fast_one_is_disconnected(
             refusal.append(str(error))
 
     hanging = in_thread(hang)
-    make = importlib.import_module(CONFIG.environment.entry_point).env
-    with simulating(opened, pettingzoo(make), episodes=4):
+    with simulating(opened, STOCK, episodes=4):
         turn = environment.start(each_agent_alone(itertools.count(), 2))
         while hanging.is_alive():
-            masks = {group: batch.observations["action_mask"] for group, batch in turn.batches.items()}
-            turn = environment.step({group: mask.argmax(axis=1) for group, mask in masks.items()})
+            turn = environment.step(first_legal(turn))
     assert "has not reported for 0.3 s" in refusal[0]
+
+
+def test_an_error_of_ours_ends_the_tournament(opened: Registry, environment: BatchedEnvironment) -> None:
+    """It is not blamed on the simulator whose message came before."""
+    seeds = iter([[1] * 8])
+
+    def next_episodes(envs: np.ndarray) -> Starts:
+        for first in seeds:
+            return Starts(envs, np.array(first), np.zeros((8, 2), np.int64))
+        raise EnvironmentMismatch("no more seeds")
+
+    def play_on() -> None:
+        turn = environment.start(next_episodes)
+        while True:
+            turn = environment.step(first_legal(turn))
+
+    with simulating(opened, STOCK, episodes=4), pytest.raises(EnvironmentMismatch, match="no more seeds"):
+        play_on()
 
 
 def test_a_simulator_that_abandons_everything_is_refused(
@@ -350,28 +364,6 @@ def test_a_simulator_that_abandons_everything_is_refused(
     in_thread(give_up)
     assert play_out(environment, 2) == ([1.0] * 4, 0)
     assert "has abandoned 21 consecutive episodes" in refusal[0]
-
-
-def test_an_error_of_ours_ends_the_tournament(opened: Registry, environment: BatchedEnvironment) -> None:
-    """It is not blamed on the simulator whose message came before."""
-    make = importlib.import_module(CONFIG.environment.entry_point).env
-    seeds = iter([[1] * 8])
-
-    def next_episodes(envs: np.ndarray) -> Starts:
-        for first in seeds:
-            return Starts(envs, np.array(first), np.zeros((8, 2), np.int64))
-        raise EnvironmentMismatch("no more seeds")
-
-    with simulating(opened, pettingzoo(make), episodes=4):
-        turn = environment.start(next_episodes)
-
-        def play_on(turn: Turn) -> None:
-            while True:
-                masks = {group: batch.observations["action_mask"] for group, batch in turn.batches.items()}
-                turn = environment.step({group: mask.argmax(axis=1) for group, mask in masks.items()})
-
-        with pytest.raises(EnvironmentMismatch, match="no more seeds"):
-            play_on(turn)
 
 
 def play_out(environment: BatchedEnvironment, episodes: int) -> tuple[list[float], int]:

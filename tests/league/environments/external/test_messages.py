@@ -21,13 +21,21 @@ MASKED = DictSpace(
         "action_mask": Box(dtype="int8", shape=(3,), low=0, high=1),
     }
 )
+
+
 PLAIN = Box(dtype="float32", shape=(4,), low=None, high=None)
+
+
 AGENTS = {
     "red": AgentInterface(observation=MASKED, action=Discrete(n=3)),
     "blue": AgentInterface(observation=MASKED, action=Discrete(n=3)),
     "referee": AgentInterface(observation=PLAIN, action=Box(dtype="float32", shape=(2,), low=-1, high=1)),
 }
+
+
 CODEC = MessageCodec(AGENTS)
+
+
 SEEN = {"observation": [1, 2], "action_mask": [1, 0, 1]}
 
 
@@ -80,31 +88,6 @@ def test_reports_are_read_by_layout() -> None:
     assert message.over == [8]
 
 
-def test_binary_reports_are_read() -> None:
-    message = CODEC.read(binary(3, flags=2 | 4))
-    assert isinstance(message, Reports)
-    (rows,) = message.rows
-    assert rows.truncated.all()
-    assert not rows.terminated.any()
-    assert message.over == [0, 1, 2]
-    assert rows.observations["action_mask"].shape == (3, 3)
-
-
-def test_a_message_has_a_block_for_each_layout() -> None:
-    message = CODEC.read(binary(2) + binary(1, layout=1, flags=4, agent=2))
-    assert isinstance(message, Reports)
-    assert [(rows.layout, len(rows.episodes)) for rows in message.rows] == [(0, 2), (1, 1)]
-    assert message.over == [0]
-
-
-def test_a_message_has_no_more_reports_than_the_simulator_has_agents() -> None:
-    assert isinstance(CODEC.read(binary(3), episodes=1), Reports)
-    with pytest.raises(InvalidInput, match="number of rows is 4"):
-        CODEC.read(binary(4), episodes=1)
-    with pytest.raises(InvalidInput, match="at most 3 objects"):
-        CODEC.read(reports(*[report()] * 4), episodes=1)
-
-
 def test_actions_are_written_in_both_forms() -> None:
     arguments = 1, np.array([5, 6]), np.array([2, 2]), np.array([[0.5, 1], [0, -1]])
     text = CODEC.actions(*arguments, binary=False)
@@ -115,68 +98,13 @@ def test_actions_are_written_in_both_forms() -> None:
     np.testing.assert_array_equal(np.frombuffer(message, "<f4", offset=HEADER.size + 2 * 6), [0.5, 1, 0, -1])
 
 
-@pytest.mark.parametrize(
-    ("message", "error", "match"),
-    [
-        ("[", InvalidInput, "no JSON"),
-        ("[]", InvalidInput, "a list, expected an object"),
-        ('{"type": "begin"}', InvalidInput, "type 'begin'"),
-        (reports(report(agent="green")), InvalidInput, "'green' is no agent"),
-        (reports(report(episode=-1)), InvalidInput, "episode is -1"),
-        (reports(report(episode=2**40)), InvalidInput, "expected an integer"),
-        (reports(report(episode=True)), InvalidInput, "episode is True"),
-        (reports(report(reward="1")), InvalidInput, "reward of red is a string"),
-        (reports(report(reward=1e999)), InvalidInput, "no JSON"),
-        (reports(report(terminated=1)), InvalidInput, "must be booleans"),
-        (reports(report(colour=1)), InvalidInput, "unknown key 'colour'"),
-        (reports({"episode": 1, "agent": "red"}), InvalidInput, "lacks the key observation"),
-        (reports(report(observation=[1, 2])), ObservationError, "expected an object"),
-        (reports(report(observation=SEEN | {"observation": [1, 2, 3]})), ObservationError, "shape"),
-        (reports(report(observation=SEEN | {"observation": [1, "2"]})), ObservationError, "string"),
-        (reports(report(observation=SEEN | {"action_mask": [0, 0, 0]})), IllegalMask, "allows no action"),
-        (reports(report(), over="all"), InvalidInput, "over must be a list"),
-        (json.dumps({"type": "abandon", "episodes": [None]}), InvalidInput, "episodes is None"),
-        (b"", InvalidInput, "0 bytes"),
-        (b"\2\1" + binary(1)[2:], InvalidInput, "starts with"),
-        (binary(1)[:-1], ObservationError, "bytes, expected"),
-        (binary(1) + b"\0", InvalidInput, "has 1 bytes, expected a header"),
-        (binary(1)[:10], ObservationError, "1 reports have 2 bytes"),
-        (HEADER.pack(PROTOCOL, REPORTS, 9, 1), InvalidInput, "layout is 9"),
-        (HEADER.pack(PROTOCOL, REPORTS, 0, 2**31), InvalidInput, "number of rows"),
-        (HEADER.pack(PROTOCOL, REPORTS, 0, 0), InvalidInput, "number of rows"),
-        (binary(1, agent=2), InvalidInput, "agent 2 is not one of layout 0"),
-        (binary(1, flags=8), InvalidInput, "flags 8"),
-        (binary(1, rewards=float("nan")), InvalidReward, "nan"),
-    ],
-)
-def test_invalid_messages_are_refused_by_name(message: str | bytes, error: type[LeagueError], match: str) -> None:
-    with pytest.raises(error, match=match):
-        CODEC.read(message)
-
-
-@pytest.mark.parametrize(
-    ("message", "match"),
-    [
-        ('{"type": "reports"}', "expected 'hello'"),
-        ('{"type": "hello", "protocol": 2}', "protocol is 2"),
-        ('{"type": "hello", "protocol": 1}', "name and version"),
-        ('{"type": "hello", "protocol": 1, "simulator": {"name": "x", "version": 1}}', "two strings"),
-        (
-            '{"type": "hello", "protocol": 1, "simulator": {"name": "x", "version": "1"}, "episodes": 0}',
-            "episodes is 0",
-        ),
-    ],
-)
-def test_an_invalid_greeting_is_refused(message: str, match: str) -> None:
-    with pytest.raises(InvalidInput, match=match):
-        CODEC.hello(message)
-
-
 values = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**65), 2**65) | st.floats() | st.text(max_size=5),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from([*SEEN, "x"]), inner, max_size=3),
     max_leaves=12,
 )
+
+
 documents = st.fixed_dictionaries(
     {"type": st.sampled_from(["reports", "abandon", "hello"])},
     optional={
@@ -215,3 +143,77 @@ def test_any_message_is_read_or_refused(message: str | bytes) -> None:
         acts = ~(rows.terminated | rows.truncated)
         if "action_mask" in rows.observations:
             assert rows.observations["action_mask"][acts].any(axis=1).all()
+
+
+def test_binary_reports_are_read_by_blocks() -> None:
+    message = CODEC.read(binary(3, flags=2 | 4), episodes=1)
+    assert isinstance(message, Reports)
+    (rows,) = message.rows
+    assert rows.truncated.all()
+    assert not rows.terminated.any()
+    assert message.over == [0, 1, 2]
+    assert rows.observations["action_mask"].shape == (3, 3)
+    message = CODEC.read(binary(2) + binary(1, layout=1, flags=4, agent=2))
+    assert isinstance(message, Reports)
+    assert [(rows.layout, len(rows.episodes)) for rows in message.rows] == [(0, 2), (1, 1)]
+    assert message.over == [0]
+    for too_many, reason in ((binary(4), "number of rows is 4"), (reports(*[report()] * 4), "at most 3 objects")):
+        with pytest.raises(InvalidInput, match=reason):
+            CODEC.read(too_many, episodes=1)
+
+
+INVALID: list[tuple[str | bytes, str]] = [
+    ("[", "no JSON"),
+    ("[]", "a list, expected an object"),
+    ('{"type": "begin"}', "type 'begin'"),
+    (reports(report(agent="green")), "'green' is no agent"),
+    (reports(report(episode=-1)), "episode is -1"),
+    (reports(report(episode=2**40)), "expected an integer"),
+    (reports(report(episode=True)), "episode is True"),
+    (reports(report(reward="1")), "reward of red is a string"),
+    (reports(report(reward=1e999)), "no JSON"),
+    (reports(report(terminated=1)), "must be booleans"),
+    (reports(report(colour=1)), "unknown key 'colour'"),
+    (reports({"episode": 1, "agent": "red"}), "lacks the key observation"),
+    (reports(report(), over="all"), "over must be a list"),
+    (json.dumps({"type": "abandon", "episodes": [None]}), "episodes is None"),
+    (b"", "0 bytes"),
+    (b"\2\1" + binary(1)[2:], "starts with"),
+    (binary(1) + b"\0", "has 1 bytes, expected a header"),
+    (HEADER.pack(PROTOCOL, REPORTS, 9, 1), "layout is 9"),
+    (HEADER.pack(PROTOCOL, REPORTS, 0, 2**31), "number of rows"),
+    (HEADER.pack(PROTOCOL, REPORTS, 0, 0), "number of rows"),
+    (binary(1, agent=2), "agent 2 is not one of layout 0"),
+    (binary(1, flags=8), "flags 8"),
+]
+
+
+INVALID_VALUES: list[tuple[str | bytes, type[LeagueError], str]] = [
+    (reports(report(observation=[1, 2])), ObservationError, "expected an object"),
+    (reports(report(observation=SEEN | {"observation": [1, 2, 3]})), ObservationError, "shape"),
+    (reports(report(observation=SEEN | {"observation": [1, "2"]})), ObservationError, "string"),
+    (reports(report(observation=SEEN | {"action_mask": [0, 0, 0]})), IllegalMask, "allows no action"),
+    (binary(1)[:-1], ObservationError, "bytes, expected"),
+    (binary(1)[:10], ObservationError, "1 reports have 2 bytes"),
+    (binary(1, rewards=float("nan")), InvalidReward, "nan"),
+]
+
+
+def test_invalid_messages_are_refused_by_name(subtests: pytest.Subtests) -> None:
+    for message, error, match in (*((message, InvalidInput, match) for message, match in INVALID), *INVALID_VALUES):
+        with subtests.test(message=message[:200]), pytest.raises(error, match=match):
+            CODEC.read(message)
+
+
+def test_an_invalid_greeting_is_refused() -> None:
+    simulator = {"name": "x", "version": "1"}
+    for changes, match in (
+        ({"type": "reports"}, "expected 'hello'"),
+        ({"protocol": 2}, "protocol is 2"),
+        ({"simulator": None}, "name and version"),
+        ({"simulator": {"name": "x", "version": 1}}, "two strings"),
+        ({"episodes": 0}, "episodes is 0"),
+    ):
+        document = {"type": "hello", "protocol": 1, "simulator": simulator} | changes
+        with pytest.raises(InvalidInput, match=match):
+            CODEC.hello(json.dumps({key: value for key, value in document.items() if value is not None}))

@@ -49,18 +49,10 @@ def opened(case: tuple[LeagueConfig, Callable[[], Any]], tmp_path: Path) -> Regi
 
 @pytest.mark.parametrize(
     ("check", "binary", "count"),
-    [
-        (assert_stepping_conforms, True, 1),
-        (assert_stepping_conforms, False, 3),
-        (assert_abandoning_conforms, True, 2),
-    ],
+    [(assert_stepping_conforms, True, 1), (assert_stepping_conforms, False, 3), (assert_abandoning_conforms, True, 2)],
 )
 def test_episodes_equal_the_plain_loop(
-    case: tuple[LeagueConfig, Callable[[], Any]],
-    opened: Registry,
-    check: Callable[..., None],
-    binary: bool,
-    count: int,
+    case: tuple[LeagueConfig, Callable[[], Any]], opened: Registry, check: Callable[..., None], binary: bool, count: int
 ) -> None:
     stock = case[1]
     steppings: list[BatchedEnvironment] = []
@@ -80,13 +72,12 @@ def test_matches_are_those_of_the_game_in_python(tmp_path: Path) -> None:
     schedule = round_robin(CONFIG, INTERFACE, CONTESTANTS, 4)
     positions = range(schedule.length)
     expected = play_matches(schedule, positions, stock_stepping(CONFIG.environment, 8), INTERFACE, build_roster())
-    make = importlib.import_module(CONFIG.environment.entry_point).env
-    with (
-        closing(stepping(opened)) as environment,
-        simulating(opened, pettingzoo(make), episodes=3, count=2),
-    ):
+    with closing(stepping(opened)) as environment, simulating(opened, pettingzoo(TICTACTOE), episodes=3, count=2):
         for _ in range(2):  # the gateway stays open between two tournaments
             assert play_matches(schedule, positions, environment, INTERFACE, build_roster()) == expected
+
+
+TICTACTOE = importlib.import_module(CONFIG.environment.entry_point).env
 
 
 class Crash(Exception):
@@ -114,7 +105,6 @@ def test_games_of_simulators_that_die_are_repeated(tmp_path: Path, deaths: int) 
     schedule = round_robin(CONFIG, INTERFACE, CONTESTANTS, 4 if deaths < 10 else 80)
     positions = range(schedule.length)
     expected = play_matches(schedule, positions, stock_stepping(CONFIG.environment, 8), INTERFACE, build_roster())
-    make = importlib.import_module(CONFIG.environment.entry_point).env
     steps = iter([*range(2, 2 + 3 * deaths, 3)][:deaths] if deaths < 10 else [5 + i % 20 for i in range(deaths)])
     died = []
 
@@ -124,10 +114,10 @@ def test_games_of_simulators_that_die_are_repeated(tmp_path: Path, deaths: int) 
             door = gateway(opened)
             for mortal in steps:
                 try:
-                    play(door, lambda: Mortal(make(), mortal))  # noqa: B023  it is called within the iteration
+                    play(door, lambda: Mortal(TICTACTOE(), mortal))  # noqa: B023  it is called within the iteration
                 except Crash:
                     died.append(mortal)
-            play(door, pettingzoo(make))
+            play(door, pettingzoo(TICTACTOE))
 
     def play(door: Gateway, make_game: Callable[[], SimulatedGame]) -> None:
         simulate(door.url, LEAGUE, make_game, name=NAME, version=VERSION, key=door.token, episodes=3)

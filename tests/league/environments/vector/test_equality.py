@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
 from league.environments.vector.vector_env import AgentRows
-from tests.support.environments.looped import Looped
+from tests.support.environments.vector_copies import Looped
 
 
 def config(entry_point: str, **kwargs: Any) -> EnvironmentConfig:
@@ -17,7 +17,11 @@ def config(entry_point: str, **kwargs: Any) -> EnvironmentConfig:
 
 
 COUNTING = "tests.support.environments.counting:counting"
+
+
 MEETING = "tests.support.environments.simultaneous:meeting"
+
+
 ENVIRONMENTS = {
     "AEC with masks": config("pettingzoo.classic.tictactoe_v3"),
     "AEC with early deaths": config(COUNTING, lives=[1, 4, 2, 4], truncated=[1, 2]),
@@ -39,14 +43,6 @@ def test_an_equal_environment_has_no_difference(name: str) -> None:
     assert found.stock_rate > 0
 
 
-def test_the_same_seed_gives_the_same_comparison() -> None:
-    spread = ENVIRONMENTS["Parallel with states"]
-    runs = [compare(spread, Looped(spread, 3), steps=100, seed=seed) for seed in (4, 4, 5)]
-    counts = [(run.steps, run.episodes) for run in runs]
-    assert counts[0] == counts[1]
-    assert counts[0] != counts[2]
-
-
 class Altered(Looped):
     """Reports are altered by `alter`, which gets each AgentRows and the number of the call."""
 
@@ -54,9 +50,9 @@ class Altered(Looped):
         super().__init__(config, 2)
         self._alter, self._calls = alter, 0
 
-    def _blocks(self, reports: Any) -> list[AgentRows]:
+    def _rows(self, reports: Any) -> list[AgentRows]:
         self._calls += 1
-        return [self._alter(rows, self._calls) for rows in super()._blocks(reports)]
+        return [self._alter(rows, self._calls) for rows in super()._rows(reports)]
 
 
 def difference(alter: Callable[[AgentRows, int], AgentRows]) -> str:
@@ -92,9 +88,8 @@ def test_the_text_names_copy_seed_step_agent_element_and_both_values() -> None:
     assert "\n" not in text
 
 
-@pytest.mark.parametrize(
-    ("alter", "expected"),
-    [
+def test_each_column_is_compared(subtests: pytest.Subtests) -> None:
+    for alter, expected in (
         (column("rewards", lambda rewards: -rewards), "rewards is -0.0, in the stock environment 0.0"),
         (column("rewards", lambda rewards: np.nextafter(rewards, 1)), "rewards is 5e-324"),
         (column("rewards", lambda rewards: rewards.astype(np.float32)), "rewards is float32[2]"),
@@ -107,10 +102,9 @@ def test_the_text_names_copy_seed_step_agent_element_and_both_values() -> None:
         (observation("observation", lambda o: o.reshape(len(o), -1)), "observation is int8[2, 18]"),
         (observation("action_mask", lambda mask: changed(mask, 0, 3)), "action_mask[3] is 2"),
         (lambda rows, call: replace(rows, observations={"observation": rows.observations["observation"]}), "action_"),
-    ],
-)
-def test_each_column_is_compared(alter: Callable[[AgentRows, int], AgentRows], expected: str) -> None:
-    assert expected in difference(alter)
+    ):
+        with subtests.test(expected=expected):
+            assert expected in difference(alter)
 
 
 def test_missing_and_exchanged_rows_are_found() -> None:
@@ -136,36 +130,6 @@ def test_arrays_that_are_changed_later_are_found() -> None:
     assert "(changed after it was reported)" in difference(observation("observation", reused))
 
 
-class OtherState(Looped):
-    def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32] | None:
-        states = super().state(env_ids)
-        assert states is not None
-        return np.nextafter(states, np.float32(1))
-
-
-class NoState(Looped):
-    def state(self, env_ids: NDArray[np.int64]) -> None:
-        return None
-
-
-class AState(Looped):
-    def state(self, env_ids: NDArray[np.int64]) -> NDArray[np.float32]:
-        return np.zeros((len(env_ids), 1), dtype=np.float32)
-
-
-@pytest.mark.parametrize(
-    ("name", "environment", "expected"),
-    [
-        ("Parallel with states", OtherState, "step 0: state[0] is "),
-        ("Parallel with states", NoState, "has no state, but the stock environment has one"),
-        ("AEC with masks", AState, "has a state, the stock environment has none"),
-    ],
-)
-def test_states_are_compared(name: str, environment: type[Looped], expected: str) -> None:
-    found = compare(ENVIRONMENTS[name], environment(ENVIRONMENTS[name], 2), 20, seed=0)
-    assert expected in (found.difference or "")
-
-
 class LendsActions(Looped):
     """Rock paper scissors. Observations are in the array of the actions."""
 
@@ -181,7 +145,32 @@ def test_the_caller_may_reuse_its_actions() -> None:
     assert "observation is 0, in the stock environment" in (found.difference or "")
 
 
-def test_other_agents_are_found() -> None:
-    other = config(COUNTING, lives=[1, 2])
-    found = compare(ENVIRONMENTS["AEC with masks"], Looped(other, 1), 10, seed=0)
-    assert "possible_agents is ('player_0', 'player_1'), in the stock environment" in (found.difference or "")
+class OtherState(Looped):
+    """Its state is what `alter` returns."""
+
+    def __init__(self, config: EnvironmentConfig, alter: Callable[[Any], Any]) -> None:
+        super().__init__(config, 2)
+        self._alter = alter
+
+    def state(self, env_ids: NDArray[np.int64]) -> Any:
+        return self._alter(super().state(env_ids))
+
+
+def test_states_and_agents_are_compared() -> None:
+    for name, alter, expected in (
+        ("Parallel with states", lambda states: np.nextafter(states, np.float32(1)), "step 0: state[0] is "),
+        ("Parallel with states", lambda _: None, "has no state, but the stock environment has one"),
+        ("AEC with masks", lambda _: np.zeros((2, 1), np.float32), "has a state, the stock environment has none"),
+    ):
+        assert expected in (
+            compare(ENVIRONMENTS[name], OtherState(ENVIRONMENTS[name], alter), 20, seed=0).difference or ""
+        )
+    comparison = compare(ENVIRONMENTS["AEC with masks"], Looped(config(COUNTING, lives=[1, 2]), 1), 10, seed=0)
+    assert "possible_agents is ('player_0', 'player_1'), in the stock environment" in (comparison.difference or "")
+
+
+def test_the_same_seed_gives_the_same_comparison() -> None:
+    spread = ENVIRONMENTS["Parallel with states"]
+    runs = [compare(spread, Looped(spread, 3), steps=100, seed=seed) for seed in (4, 4, 5)]
+    first, again, other = ((run.steps, run.episodes) for run in runs)
+    assert first == again != other

@@ -1,21 +1,32 @@
-"""SuperSuit's wrappers by name, for both PettingZoo APIs, and those that are rejected."""
+"""SuperSuit's wrappers by name, for both PettingZoo APIs, and on all agents at once: values, dtypes and spaces equal
+SuperSuit's.
+"""
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 import pytest
+import supersuit
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build
 from league.environments.lockstep import stock_stepping
+from league.environments.wrappers.transforms import Resize
+from league.environments.wrappers.wrapping import BatchedWrappers
 from league.errors import ConfigError
-from tests.conformance.stepping import lockstep
+from tests.conformance.stepping import assert_same_episode, lockstep
+from tests.support.environments.wrapped import assert_same_episodes, with_supersuit
 
 HERE = __name__
 WALKER, SPREAD = "pettingzoo.sisl.multiwalker_v9", "mpe2.simple_spread_v3"
-ADVERSARY, PISTONBALL = "mpe2.simple_adversary_v3", "pettingzoo.butterfly.pistonball_v6"
+ADVERSARY, PURSUIT = "mpe2.simple_adversary_v3", "pettingzoo.sisl.pursuit_v5"
+PISTONBALL, PONG = "pettingzoo.butterfly.pistonball_v6", "pettingzoo.butterfly.cooperative_pong_v6"
 WRAPPERS: dict[str, tuple[str, dict[str, Any]]] = {
-    "action_lambda_v1": (SPREAD, {"change_action_fn": f"{HERE}:same", "change_space_fn": f"{HERE}:same_space"}),
+    "action_lambda_v1": (SPREAD, {"change_action_fn": f"{HERE}:same", "change_space_fn": f"{HERE}:same"}),
     "agent_indicator_v0": (SPREAD, {}),
     "black_death_v3": (SPREAD, {}),
     "clip_actions_v0": (WALKER, {}),
@@ -37,28 +48,67 @@ WRAPPERS: dict[str, tuple[str, dict[str, Any]]] = {
     "pad_observations_v0": (ADVERSARY, {}),
     "reshape_v0": (SPREAD, {"shape": [2, 9]}),
     "resize_v1": (PISTONBALL, {"x_size": 8, "y_size": 8}),
-    "reward_lambda_v0": (SPREAD, {"change_reward_fn": f"{HERE}:halved"}),
+    "reward_lambda_v0": (SPREAD, {"change_reward_fn": f"{HERE}:doubled"}),
     "scale_actions_v0": (WALKER, {"scale": 0.5}),
     "sticky_actions_v0": (SPREAD, {"repeat_action_probability": 0.3}),
 }
+
+
 REJECTED = {"concat_vec_envs_v1", "vectorize_aec_env_v0", "gym_vec_env_v0", "pettingzoo_env_to_vec_env_v1"}
+
+
 REJECTED |= {"stable_baselines3_vec_env_v0", "stable_baselines_vec_env_v0"}
 
 
-def same(action: Any, _space: Any) -> Any:
-    return action
+SMALL = {"n_pistons": 3, "max_cycles": 25, "render_mode": "rgb_array"}
 
 
-def same_space(space: Any) -> Any:
-    return space
+BLUE, GREY = {"color_reduction_v0": {"mode": "B"}}, "color_reduction_v0"
 
 
-def doubled(observation: np.ndarray, _space: Any) -> np.ndarray:
-    return observation * 2
+SIZE = {"resize_v1": {"x_size": 42, "y_size": 31}}
 
 
-def halved(reward: float) -> float:
-    return reward / 2
+STACK = {"frame_stack_v1": {"stack_size": 4}}
+
+
+FLOAT = {"dtype_v0": {"dtype": "float32"}}
+
+
+CASES: list[tuple[str, dict[str, Any], list[Any]]] = [
+    (PISTONBALL, SMALL, [BLUE, {"resize_v1": {"x_size": 84, "y_size": 84}}, STACK]),
+    (PISTONBALL, SMALL, [GREY, SIZE, FLOAT, "normalize_obs_v0", {"frame_stack_v1": {"stack_size": 3}}, "flatten_v0"]),
+    (PISTONBALL, SMALL, [SIZE, "agent_indicator_v0", {"frame_stack_v1": {"stack_size": 2}}]),
+    (PISTONBALL, SMALL, [BLUE, SIZE, {"agent_indicator_v0": {"type_only": True}}, {"dtype_v0": {"dtype": "int32"}}]),
+    (PISTONBALL, SMALL, [FLOAT, SIZE, {"normalize_obs_v0": {"env_min": -1, "env_max": 3}}]),
+    (PONG, {"max_cycles": 20, "render_mode": "rgb_array"}, [{"color_reduction_v0": {"mode": "G"}}, SIZE, STACK]),
+    (SPREAD, {}, ["agent_indicator_v0", STACK]),
+    (SPREAD, {}, ["pad_observations_v0", "agent_indicator_v0"]),
+    (SPREAD, {}, [STACK, {"reshape_v0": {"shape": [4, 18]}}, {"dtype_v0": {"dtype": "float64"}}]),
+    (PURSUIT, {"max_cycles": 15}, [FLOAT, SIZE, STACK, "flatten_v0"]),
+]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_resizing_equals_tinyscalers(data: st.DataObject) -> None:
+    import tinyscaler
+
+    sizes = st.integers(2, 60)
+    height, width, to_height, to_width = (data.draw(sizes) for _ in range(4))
+    channels = data.draw(st.sampled_from([1, 3, 4]))
+    images = data.draw(arrays.arrays(np.uint8, (2, height, width, channels)))
+    resized = Resize(height, width, to_height, to_width)(images, np.arange(2))
+    for image, mine in zip(images, resized, strict=True):
+        np.testing.assert_array_equal(mine, tinyscaler.scale(src=image, size=(to_width, to_height), mode="bilinear"))
+
+
+def same(value: Any, _space: Any = None) -> Any:
+    return value
+
+
+def doubled(value: Any, _space: Any = None) -> Any:
+    return value * 2
 
 
 def config(entry_point: str, *wrappers: Any, **more: Any) -> EnvironmentConfig:
@@ -66,10 +116,11 @@ def config(entry_point: str, *wrappers: Any, **more: Any) -> EnvironmentConfig:
 
 
 def test_the_wrappers_are_those_of_supersuit() -> None:
-    import supersuit
-
     names = {name for name in dir(supersuit) if name[-3:-1] == "_v" and name[-1].isdigit()}
     assert names == set(WRAPPERS) | REJECTED
+    for name in REJECTED:
+        with pytest.raises(ConfigError, match=rf"{name} creates a vector environment"):
+            build(config(SPREAD, name))
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -84,44 +135,51 @@ def test_each_wrapper_steps_in_lockstep_and_follows_the_seed(name: str, api: Any
     envs = stock_stepping(wrapped, 2)
     first, again = (lockstep(envs, spaces, seeds, 6) for seeds in ([1, 2], [2, 1]))
     for seed in (1, 2):
-        for agent, reports in first[seed].items():
-            for one, other in zip(reports, again[seed][agent], strict=True):
-                assert one[2:] == other[2:]
-                np.testing.assert_array_equal(one[1]["observation"], other[1]["observation"])
+        assert_same_episode(again[seed], first[seed])
 
 
-@pytest.mark.parametrize("name", sorted(REJECTED))
-def test_vector_environments_are_rejected(name: str) -> None:
-    with pytest.raises(ConfigError, match=rf"{name} creates a vector environment"):
-        build(config(SPREAD, name))
-
-
-@pytest.mark.parametrize(
-    ("wrappers", "message"),
-    [
-        (
-            ["flatten_v0", {"resize_v1": {"x_size": 8, "y_size": 8}}],
-            r"resize_v1 \(number 2\).*piston_0 has observations Box",
-        ),
+def test_invalid_wrappers_are_rejected_with_name_position_and_reason(subtests: pytest.Subtests) -> None:
+    resized = {"resize_v1": {"x_size": 8, "y_size": 8}}
+    for wrappers, message in (
+        (["flatten_v0", resized], r"resize_v1 \(number 2\).*piston_0 has observations Box"),
         ([{"color_reduction_v0": {"mode": "B"}}, "color_reduction_v0"], r"color_reduction_v0 \(number 2\).*3d image"),
         (["normalize_obs_v0"], r"normalize_obs_v0 \(number 1\)"),
         ([{"resize_v1": {"x": 8}}], r"resize_v1 \(number 1\).*'x'"),
         ([{"reshape_v0": {"shape": [3]}}], r"reshape_v0 \(number 1\).*as many elements"),
         (["frame_stack_v0"], "SuperSuit has no wrapper 'frame_stack_v0'.*use frame_stack_v1 instead"),
         (["frame_stak_v2"], "SuperSuit has no wrapper 'frame_stak_v2': did you mean 'frame_stack_v2'?"),
+        (["gymnasium"], "no wrapper 'gymnasium'"),
         (["utils"], "'utils' of SuperSuit is not a wrapper"),
         (
             [{"observation_lambda_v0": {"change_observation_fn": "no.such:thing"}}],
             "observation_lambda_v0.change_observation_fn: cannot import 'no.such'",
         ),
-    ],
-)
-def test_invalid_wrappers_are_rejected_with_name_position_and_reason(wrappers: list[Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        build(config(PISTONBALL, *wrappers))
-
-
-def test_an_agent_indicator_requires_equal_observation_spaces() -> None:
+    ):
+        with subtests.test(wrappers=wrappers), pytest.raises(ConfigError, match=message):
+            build(config(PISTONBALL, *wrappers))
     with pytest.raises(ConfigError, match=r"agent_indicator_v0 \(number 1\).*pad_observations"):
         build(config(ADVERSARY, "agent_indicator_v0"))
     build(config(ADVERSARY, "pad_observations_v0", "agent_indicator_v0"))
+    with pytest.raises(ConfigError, match=r"flatten_v0 \(number 1\).*RLlib"):
+        build(config("policy_league.examples.traffic:crossing", "flatten_v0"))
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("case", CASES, ids=str)
+def test_episodes_equal_supersuits(case: tuple[str, dict[str, Any], list[Any]]) -> None:
+    entry_point, kwargs, wrappers = case
+    ours = build(EnvironmentConfig(entry_point=entry_point, kwargs=kwargs, wrappers=wrappers))
+    assert isinstance(ours, BatchedWrappers) or not wrappers
+    assert_same_episodes(ours, with_supersuit(import_module(entry_point).parallel_env(**kwargs), wrappers))
+
+
+def test_unsupported_wrappers_remain_supersuits() -> None:
+    for entry_point, wrapper in (
+        (SPREAD, {"frame_stack_v1": {"stack_dim": 0}}),  # stacks images differently
+        (SPREAD, {"frame_skip_v0": {"num_frames": 2}}),  # changes more than observations
+        (ADVERSARY, "flatten_v0"),  # agents have different observation spaces
+        (PURSUIT, {"resize_v1": {"x_size": 4, "y_size": 4, "linear_interp": False}}),
+    ):
+        env = build(config(entry_point, wrapper))
+        assert not isinstance(env, BatchedWrappers)
+        env.reset(seed=0)

@@ -3,11 +3,10 @@
 from functools import cache
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from league.policies.line_games.game import CONNECT_FOUR, TIC_TAC_TOE, LineGame
+from league.policies.line_games.game import CONNECT_FOUR, TIC_TAC_TOE
 from league.policies.line_games.minimax import LOST, BatchedMinimax
 from league.policies.line_games.solver import LineGameSolver
 from league.policies.scripted import script
@@ -59,18 +58,14 @@ def test_a_search_to_the_end_of_tic_tac_toe_is_exact(seed: int) -> None:
     assert {action: int(signs[action]) for action in outcomes} == outcomes
 
 
-@pytest.mark.parametrize(("plies", "answers"), [(2, {0, 1, 2, 3, 4, 5, 6}), (4, {1, 4})])
-def test_four_plies_prevent_an_open_line(plies: int, answers: set[int]) -> None:
+def test_four_plies_prevent_an_open_line() -> None:
     """With 2, 3 taken in the lowest row, 1 or 4 would make a line that is open at both ends."""
     env = environment_after("connect_four", [2, 2, 3])
     batch = observations([env] * 200)
-    rng = [np.random.default_rng(row) for row in range(200)]
-    chosen = set(script(f"minimax_{plies}", *spaces(env)).act(batch, rng=rng).actions.tolist())
-    assert chosen == answers
-
-
-@pytest.mark.parametrize("game", [CONNECT_FOUR, TIC_TAC_TOE])
-def test_an_empty_batch(game: LineGame) -> None:
-    search = BatchedMinimax(game)
-    boards = np.zeros((0, game.rows, game.columns, 2), np.int8)
-    assert search.values(*search.positions(boards), 4).shape == (0, game.actions)
+    for plies, answers in ((2, {0, 1, 2, 3, 4, 5, 6}), (4, {1, 4})):
+        rng = [np.random.default_rng(row) for row in range(200)]
+        assert set(script(f"minimax_{plies}", *spaces(env)).act(batch, rng=rng).actions.tolist()) == answers
+    for game in GAMES.values():
+        search = BatchedMinimax(game)
+        boards = np.zeros((0, game.rows, game.columns, 2), np.int8)
+        assert search.values(*search.positions(boards), 4).shape == (0, game.actions)

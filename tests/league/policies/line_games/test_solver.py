@@ -33,24 +33,11 @@ def expected_outcomes(name: str, moves: Sequence[int]) -> dict[int, int]:
     }
 
 
-@pytest.mark.parametrize("seed", [28, 40, 59, 102, 173, 176, 224])
-@pytest.mark.parametrize("plies", [32, 34, 36])
-def test_late_outcomes_of_connect_four_equal_those_of_minimax(seed: int, plies: int) -> None:
-    """The random games of these seeds have more than 36 plies."""
-    moves = random_moves("connect_four", seed, plies)
-    assert len(moves) == plies
-    assert outcomes(CONNECT_FOUR, environment_after("connect_four", moves)) == expected_outcomes("connect_four", moves)
-
-
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10_000), st.integers(2, 8))
+@given(st.integers(0, 10_000), st.integers(2, 8) | st.just(0))
 def test_outcomes_of_tic_tac_toe_equal_those_of_minimax(seed: int, plies: int) -> None:
     moves = random_moves("tictactoe", seed, plies)
     assert outcomes(TIC_TAC_TOE, environment_after("tictactoe", moves)) == expected_outcomes("tic_tac_toe", moves)
-
-
-def test_tic_tac_toe_is_a_draw() -> None:
-    assert set(outcomes(TIC_TAC_TOE, environment_after("tictactoe", [])).values()) == {0}
 
 
 def test_it_plays_each_of_the_best_actions() -> None:
@@ -61,14 +48,26 @@ def test_it_plays_each_of_the_best_actions() -> None:
         assert set(script("solver", *spaces(env)).act(observations([env] * 80), rng=rng).actions.tolist()) == best
 
 
-@pytest.mark.parametrize("plies", [0, 41 - MAX_EMPTY])
-def test_early_positions_of_connect_four_are_played_like_one_ply(plies: int) -> None:
-    seed = next(seed for seed in range(1000) if len(random_moves("connect_four", seed, plies)) == plies)
-    env = environment_after("connect_four", random_moves("connect_four", seed, plies))
-    assert len(legal(env)) > 1
-    batch = observations([env] * 50)
-    actions = [
-        script(name, *spaces(env)).act(batch, rng=[np.random.default_rng(row) for row in range(50)]).actions.tolist()
-        for name in ("solver", "one_ply")
-    ]
-    assert actions[0] == actions[1]
+@pytest.mark.parametrize("seed", [28, 40, 59, 102, 173, 176, 224])
+def test_late_outcomes_of_connect_four_equal_those_of_minimax(seed: int) -> None:
+    """The random games of these seeds have more than 36 plies."""
+    for plies in (32, 34, 36):
+        moves = random_moves("connect_four", seed, plies)
+        assert len(moves) == plies
+        env = environment_after("connect_four", moves)
+        assert outcomes(CONNECT_FOUR, env) == expected_outcomes("connect_four", moves)
+
+
+def test_early_positions_of_connect_four_are_played_like_one_ply() -> None:
+    for plies in (0, 41 - MAX_EMPTY):
+        seed = next(seed for seed in range(1000) if len(random_moves("connect_four", seed, plies)) == plies)
+        env = environment_after("connect_four", random_moves("connect_four", seed, plies))
+        assert len(legal(env)) > 1
+        batch = observations([env] * 50)
+        first, second = (
+            script(name, *spaces(env))
+            .act(batch, rng=[np.random.default_rng(row) for row in range(50)])
+            .actions.tolist()
+            for name in ("solver", "one_ply")
+        )
+        assert first == second

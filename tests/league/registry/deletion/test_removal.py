@@ -1,14 +1,14 @@
 """Removal of versions and leagues, with what depends on them, and after a crash at any point."""
 
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
-from sqlalchemy import func, inspect, select, text
+from sqlalchemy import func, select, text
 
-from league.errors import Conflict, LeagueArchived, NothingToRollBack, UnknownLeague, UnknownVersion
+from league.errors import Conflict, LeagueArchived, NothingToRollBack, UnknownLeague
 from league.refs import CheckpointRef
-from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.rows import Portion, RunPoint, StrengthRow
 from league.registry.storage.tables import Base
@@ -18,8 +18,14 @@ from tests.support.leagues.ledger_matches import SCHEDULE, play_match
 from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered
 
 OTHER = "another"
+
+
 VERDICT = f"{LEAGUE}-verdict-0f3a62d1c8b45e97-1b2c3d4e"
+
+
 ANCHOR = f"{LEAGUE}-anchor-77c01d2e"
+
+
 SETTINGS: dict[str, Any] = {"gate": {"alpha": 0.05}, "tests": [{"kind": "anchor", "schedule": ANCHOR}]}
 
 
@@ -41,26 +47,11 @@ def used(registry: Registry) -> Registry:
     move(registry, 2, 3, None)
     registry.verdicts.close(VERDICT, "promote", {"promoted": True})
     registry.versions.set_note(CheckpointRef(LEAGUE, 3), "strong", actor="me")
-    registry.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=0, target=10, parent=1)
-    registry.runs.record(
-        LEAGUE, "run", RunPoint(LEAGUE, "run", 5, {"return": 1.0}, registry.runs.get(LEAGUE, "run").began_at)
-    )
+    run = registry.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=0, target=10, parent=1)
+    registry.runs.record(LEAGUE, "run", RunPoint(LEAGUE, "run", 5, {"return": 1.0}, run.began_at))
     registry.runs.end(LEAGUE, "run", "ended")
     for version, opponent in ((1, "script:random"), (2, f"{LEAGUE}@3"), (3, "script:random")):
-        at = registry.versions.get(LEAGUE, version).created_at
-        score = StrengthRow(
-            league=LEAGUE,
-            run="run",
-            version=version,
-            opponent=opponent,
-            steps=5,
-            games=8,
-            score=0.5,
-            low=0.3,
-            high=0.7,
-            at=at,
-        )
-        registry.strength.record([score])
+        registry.strength.record([replace(STRENGTH, version=version, opponent=opponent)])
     registry.nightly_runs.close(registry.nightly_runs.open(LEAGUE, [3], 0.05).id, {})
     registry.training_nights.open(LEAGUE)
     registry.traffic.set(LEAGUE, shadow=Portion(1, 0.5), actor="me", reason="")
@@ -68,19 +59,23 @@ def used(registry: Registry) -> Registry:
     return registry
 
 
+def test_canaries_and_candidates_of_a_nightly_run_are_in_use(registry: Registry) -> None:
+    registered(registry, versions=3)
+    registry.nightly_runs.open(LEAGUE, [2], 0.05)
+    registry.traffic.set(LEAGUE, canary=Portion(1, 0.5), actor="me", reason="")
+    for number, reason in ((1, "it is the canary"), (2, "nightly run 1 tests it")):
+        with pytest.raises(Conflict, match=reason):
+            registry.removal.remove_version(CheckpointRef(LEAGUE, number))
+    plan = registry.removal.plan_version(CheckpointRef(LEAGUE, 3))
+    assert plan.versions[3] > 256
+    assert registry.removal.remove_version(CheckpointRef(LEAGUE, 3)) == plan
+    registry.removal.remove_version(CheckpointRef(LEAGUE, 1), force=True, actor="ada")
+    setting = registry.traffic.current(LEAGUE)
+    assert (setting.canary, setting.actor, setting.reason) == (None, "ada", f"{LEAGUE}@1 was removed")
+
+
 def move(registry: Registry, version: int, expected: int | None, verdict: str | None) -> None:
     registry.aliases.set(LEAGUE, "champion", version, expected=expected, actor="me", reason="", verdict=verdict)
-
-
-def rows_of(registry: Registry, league: str) -> dict[str, int]:
-    """Table → number of rows of a league, without empty tables."""
-    found = {}
-    with registry.database.read() as session:
-        for table in Base.metadata.sorted_tables:
-            column = table.c.get("league", table.c.get("slug"))
-            if column is not None:
-                found[table.name] = session.scalar(select(func.count()).select_from(table).where(column == league)) or 0
-    return {name: count for name, count in found.items() if count}
 
 
 def test_a_version_on_which_something_depends_is_kept(used: Registry) -> None:
@@ -94,17 +89,6 @@ def test_a_version_on_which_something_depends_is_kept(used: Registry) -> None:
         for reason in (f"{LEAGUE}@{number} is in use", "--force", *reasons):
             assert reason in str(refused.value)
         assert rows_of(used, LEAGUE) == before
-
-
-def test_a_version_without_dependents_is_removed_and_its_number_is_not_reused(used: Registry) -> None:
-    publish(used, "run/4")
-    plan = used.removal.plan_version(CheckpointRef(LEAGUE, 4))
-    assert plan.versions[4] > 256
-    assert used.removal.remove_version(CheckpointRef(LEAGUE, 4)) == plan
-    with pytest.raises(UnknownVersion):
-        used.versions.get(LEAGUE, 4)
-    assert leftovers(used) == []
-    assert publish(used, "run/5").number == 5
 
 
 def test_exploiters_that_were_trained_for_a_verdict_are_in_use(used: Registry) -> None:
@@ -152,50 +136,32 @@ def test_force_removes_the_champion_and_its_alias(used: Registry) -> None:
     plan = used.removal.remove_version(CheckpointRef(LEAGUE, "champion"), force=True)
     assert used.changes.counts().aliases == before.aliases + 1, "replicas follow"
     assert (plan.target, plan.aliases) == (f"{LEAGUE}@2", ("champion",))
-    assert used.aliases.current(LEAGUE) == {}
     with pytest.raises(NothingToRollBack, match="alias champion of league tictactoe is not set: promote"):
         used.aliases.rollback(LEAGUE, actor="me", reason="")
-    used.removal.remove_version(CheckpointRef(LEAGUE, 1), force=True)
-    assert [row.number for row in used.versions.all(LEAGUE)] == [3]
+    for number in (1, 3):
+        used.removal.remove_version(CheckpointRef(LEAGUE, number), force=True)
     assert used.runs.get(LEAGUE, "run").parent is None
+    with used.database.read() as session:
+        assert session.execute(text("PRAGMA foreign_key_check")).all() == []
 
 
-def test_force_ends_the_canary_and_the_shadow_of_a_version(registry: Registry) -> None:
-    registered(registry, versions=3)
-    registry.aliases.set(LEAGUE, "beta", 3, expected=ANY, actor="me", reason="")
-    registry.traffic.set(LEAGUE, canary=Portion(2, 0.5), shadow=Portion("beta", 1.0), actor="me", reason="")
-    registry.removal.remove_version(CheckpointRef(LEAGUE, 3), force=True, actor="ada")
-    now = registry.traffic.current(LEAGUE)
-    assert (now.canary, now.shadow) == (Portion(2, 0.5), None)
-    assert (now.actor, now.reason) == ("ada", f"{LEAGUE}@3 was removed")
-    registry.removal.remove_version(CheckpointRef(LEAGUE, 2), force=True)
-    now = registry.traffic.current(LEAGUE)
-    assert (now.canary, now.shadow) == (None, None)
+def leftovers_of_removed(registry: Registry) -> list[str]:
+    directory = registry.artifacts.root / LEAGUE
+    return [path.name for path in directory.iterdir()] if directory.exists() else []
 
 
-def test_canaries_and_candidates_of_a_nightly_run_are_in_use(registry: Registry) -> None:
-    registered(registry, versions=2)
-    registry.traffic.set(LEAGUE, canary=Portion(1, 0.5), actor="me", reason="")
-    registry.nightly_runs.open(LEAGUE, [2], 0.05)
-    with pytest.raises(Conflict, match="it is the canary"):
-        registry.removal.remove_version(CheckpointRef(LEAGUE, 1))
-    with pytest.raises(Conflict, match="nightly run 1 tests it"):
-        registry.removal.remove_version(CheckpointRef(LEAGUE, 2))
-
-
-def test_nothing_is_removed_during_training_or_an_evaluation(registry: Registry) -> None:
-    registered(registry, versions=1)
-    registry.runs.begin(LEAGUE, "active", algorithm="ppo", settings={}, seed=0, target=10)
-    for remove in (
-        lambda: registry.removal.remove_league(LEAGUE, force=True),
-        lambda: registry.removal.remove_version(CheckpointRef(LEAGUE, 1), force=True),
-    ):
-        with pytest.raises(Conflict, match="training run active of league tictactoe is active"):
-            remove()
-    registry.runs.end(LEAGUE, "active", "stopped")
-    registry.evaluations.submit(LEAGUE, {"kind": "gauntlet"}, actor="me", max_active=1)
-    with pytest.raises(Conflict, match="evaluation 1 of league tictactoe is queued"):
-        registry.removal.remove_league(LEAGUE, force=True)
+STRENGTH = StrengthRow(
+    league=LEAGUE,
+    run="run",
+    version=1,
+    opponent="",
+    steps=5,
+    games=8,
+    score=0.5,
+    low=0.3,
+    high=0.7,
+    at=datetime.now(UTC),
+)
 
 
 def test_a_league_in_use_is_removed_by_force_only(used: Registry) -> None:
@@ -219,17 +185,6 @@ def test_a_league_in_use_is_removed_by_force_only(used: Registry) -> None:
         used.removal.remove_league(LEAGUE)
 
 
-def leftovers_of_removed(registry: Registry) -> list[str]:
-    directory = registry.artifacts.root / LEAGUE
-    return [path.name for path in directory.iterdir()] if directory.exists() else []
-
-
-def test_a_league_without_results_needs_no_force(registry: Registry) -> None:
-    registered(registry, versions=2)
-    registry.removal.remove_league(LEAGUE)
-    assert registry.leagues.names() == {}
-
-
 def test_an_interrupted_removal_leaves_an_archived_league_and_can_be_completed(
     used: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -245,25 +200,6 @@ def test_an_interrupted_removal_leaves_an_archived_league_and_can_be_completed(
     assert leftovers_of_removed(used) == []
 
 
-@pytest.mark.parametrize("writes", [1, 2])
-def test_a_removal_of_a_version_is_completed_by_the_next_publication(
-    used: Registry, monkeypatch: pytest.MonkeyPatch, writes: int
-) -> None:
-    with pytest.raises(ProcessDeath), crash_after(writes, monkeypatch):
-        used.removal.remove_version(CheckpointRef(LEAGUE, 3), force=True)
-    assert [row.number for row in used.versions.all(LEAGUE)] == [1, 2]
-    assert publish(used, "run/9").number == 4
-    assert leftovers(used) == []
-
-
-def test_no_row_refers_to_a_missing_one(used: Registry) -> None:
-    used.removal.remove_version(CheckpointRef(LEAGUE, 1), force=True)
-    used.removal.remove_version(CheckpointRef(LEAGUE, 3), force=True)
-    if inspect(used.database.engine).dialect.name == "sqlite":
-        with used.database.read() as session:
-            assert session.execute(text("PRAGMA foreign_key_check")).all() == []
-
-
 def test_a_member_of_a_mixture_is_not_removed_before_the_mixture(registry: Registry) -> None:
     publish(registry, "run/1")
     publish(registry, "run/2")
@@ -275,3 +211,37 @@ def test_a_member_of_a_mixture_is_not_removed_before_the_mixture(registry: Regis
     registry.removal.remove_version(CheckpointRef(LEAGUE, mixture.number))
     registry.removal.remove_version(member)
     assert [row.number for row in registry.versions.all(LEAGUE)] == [2]
+
+
+def rows_of(registry: Registry, league: str) -> dict[str, int]:
+    """Table → number of rows of a league, without empty tables."""
+    columns = {table.name: table.c.get("league", table.c.get("slug")) for table in Base.metadata.sorted_tables}
+    with registry.database.read() as session:
+        counts = {
+            name: session.scalar(select(func.count()).where(column == league)) or 0
+            for name, column in columns.items()
+            if column is not None
+        }
+    return {name: count for name, count in counts.items() if count}
+
+
+def test_nothing_is_removed_during_training_or_an_evaluation(registry: Registry) -> None:
+    registered(registry, versions=1)
+    registry.runs.begin(LEAGUE, "active", algorithm="ppo", settings={}, seed=0, target=10)
+    with pytest.raises(Conflict, match="training run active of league tictactoe is active"):
+        registry.removal.remove_version(CheckpointRef(LEAGUE, 1), force=True)
+    registry.runs.end(LEAGUE, "active", "stopped")
+    registry.evaluations.submit(LEAGUE, {"kind": "gauntlet"}, actor="me", max_active=1)
+    with pytest.raises(Conflict, match="evaluation 1 of league tictactoe is queued"):
+        registry.removal.remove_league(LEAGUE, force=True)
+
+
+def test_a_removal_of_a_version_is_completed_by_the_next_publication(
+    used: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for writes, number in ((1, 3), (2, 1)):
+        with pytest.raises(ProcessDeath), crash_after(writes, monkeypatch):
+            used.removal.remove_version(CheckpointRef(LEAGUE, number), force=True)
+        assert number not in [row.number for row in used.versions.all(LEAGUE)]
+        assert publish(used, f"run/after {number}").number == 5 - writes % 2
+        assert leftovers(used) == []

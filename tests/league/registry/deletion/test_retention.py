@@ -57,21 +57,6 @@ def test_needed_versions_keep_their_policies(versions: Registry, tmp_path: Path)
     assert retire(versions) == (set(), set()), "nothing is left to remove"
 
 
-def test_a_retired_version_is_listed_but_cannot_be_used(versions: Registry) -> None:
-    assert retire(versions)[0] == {1, 2, 3, 4, 5}
-    rows = versions.versions.all(LEAGUE)
-    assert [row.retired_at is not None for row in rows] == [True] * 5 + [False]
-    assert versions.versions.numbers(LEAGUE) == {LEAGUE: [6]}
-    message = f"{LEAGUE}@2 was retired"
-    with pytest.raises(VersionRetired, match=message):
-        versions.versions.fetch(LEAGUE, 2)
-    with pytest.raises(VersionRetired, match=message):
-        versions.aliases.set(LEAGUE, "champion", 2, expected=None, actor="me", reason="")
-    with pytest.raises(VersionRetired, match=message):
-        versions.traffic.set(LEAGUE, canary=Portion(2, 0.5), actor="me", reason="")
-    assert publish(versions, "run/7").number == 7
-
-
 def test_new_versions_and_those_of_open_tests_stay(versions: Registry) -> None:
     publish(versions, "run/7")
     versions.nightly_runs.open(LEAGUE, [2], alpha=0.05)
@@ -85,19 +70,6 @@ def test_a_void_verdict_and_purged_games_need_nothing(versions: Registry) -> Non
     versions.verdicts.void("verdict", "a mistake")
     Ledger(versions).purge([plan.id])
     assert retire(versions, keep=2) == ({1, 2, 3, 4}, set())
-
-
-def test_young_versions_stay(registry: Registry) -> None:
-    for number in range(3):
-        publish(registry, f"run/{number}")
-    assert retire(registry) == (set(), set())
-
-
-def test_a_plan_changes_nothing(versions: Registry) -> None:
-    removal = versions.retention.plan(LEAGUE, keep=1, before=datetime.now(UTC))
-    assert set(removal.versions) == {1, 2, 3, 4, 5}
-    assert removal.size == sum(versions.artifacts.size(LEAGUE, number) for number in range(1, 6)) > 0
-    assert all(row.retired_at is None for row in versions.versions.all(LEAGUE))
 
 
 def test_an_interrupted_removal_is_completed(versions: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -116,14 +88,28 @@ def test_an_interrupted_removal_is_completed(versions: Registry, monkeypatch: py
     assert [path.name for path in sorted((versions.artifacts.root / LEAGUE).iterdir())] == ["1", "2", "6"]
 
 
-def test_an_unknown_league_is_reported(registry: Registry) -> None:
-    with pytest.raises(UnknownLeague):
-        registry.retention.retire("other", keep=1, before=datetime.now(UTC))
-
-
 def test_no_version_is_retired_while_its_league_is_trained(versions: Registry) -> None:
     """Any version may be an opponent. The training state of opponents is not needed."""
     versions.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=0, target=100)
     assert retire(versions) == (set(), {1, 2, 3, 4, 5})
     versions.runs.end(LEAGUE, "run", "ended")
     assert retire(versions)[0] == {1, 2, 3, 4, 5}
+
+
+def test_a_retired_version_is_listed_but_cannot_be_used(versions: Registry) -> None:
+    plan = versions.retention.plan(LEAGUE, keep=1, before=datetime.now(UTC))
+    assert plan.size == sum(versions.artifacts.size(LEAGUE, number) for number in range(1, 6)) > 0
+    assert all(row.retired_at is None for row in versions.versions.all(LEAGUE))
+    assert retire(versions)[0] == set(plan.versions) == {1, 2, 3, 4, 5}
+    for use in (
+        lambda: versions.versions.fetch(LEAGUE, 2),
+        lambda: versions.aliases.set(LEAGUE, "champion", 2, expected=None, actor="me", reason=""),
+        lambda: versions.traffic.set(LEAGUE, canary=Portion(2, 0.5), actor="me", reason=""),
+    ):
+        with pytest.raises(VersionRetired, match=f"{LEAGUE}@2 was retired"):
+            use()
+    assert publish(versions, "run/7").number == 7
+    assert retire(versions, keep=0) == ({6}, set()), "version 7 is young"
+    for act in (versions.retention.plan, versions.retention.retire):
+        with pytest.raises(UnknownLeague):
+            act("other", keep=1, before=datetime.now(UTC))

@@ -1,6 +1,8 @@
-"""A lock that is lost ends the work of its holder."""
+"""A lock is held by one process until it ends, and a lock that is lost ends the work of its holder."""
 
-import threading
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from uuid import uuid4
 
@@ -11,18 +13,12 @@ from league.errors import AlreadyRunning, StorageError
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.settings import Storage
+from tests.support.databases import on_both_databases
 from tests.support.leagues.registries import LEAGUE, registered
 from tests.support.servers import postgresql
+from tests.support.waiting import until
 
 HOLDERS = "SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted"
-
-
-@pytest.fixture
-def registry(tmp_path: Path, postgresql_socket: Path) -> Registry:
-    """A registry on PostgreSQL: with SQLite, only the end of the process releases the lock."""
-    url = postgresql.create(postgresql_socket, f"lock_{uuid4().hex}")
-    storage = Storage(tmp_path / "home", url, tmp_path / "artifacts")
-    return registered(Registry.open(storage), LEAGUE, versions=3)
 
 
 def promote(registry: Registry, version: int) -> None:
@@ -54,10 +50,63 @@ def test_changes_are_made_while_the_lock_is_held(registry: Registry) -> None:
         pass
 
 
+HOLDER = """
+import sys
+from league.registry.registry import Registry
+from league.settings import Storage
+from pathlib import Path
+storage = Storage(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]))
+with Registry.open(storage).exclusive_lock("nightly-chess"):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@on_both_databases
+def test_one_process_holds_the_lock_until_it_exits(storage: Storage) -> None:
+    registry = Registry.open(storage)
+    command = [sys.executable, "-c", HOLDER, str(storage.home), storage.database_url, str(storage.artifacts)]
+
+    def is_free() -> bool:
+        try:
+            with registry.exclusive_lock("nightly-chess"):
+                return True
+        except AlreadyRunning:
+            return False
+
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with (
+            pytest.raises(AlreadyRunning, match="another process is running nightly-chess"),
+            registry.exclusive_lock("nightly-chess"),
+        ):
+            pass
+        with registry.exclusive_lock("nightly-go"):
+            pass
+        holder.kill()
+        holder.wait()
+    until(is_free)  # a server notices within moments that the connection of its holder is gone
+    with (
+        registry.exclusive_lock("nightly-chess"),
+        pytest.raises(AlreadyRunning),
+        Registry.open(storage).exclusive_lock("nightly-chess"),
+    ):
+        pass
+
+
+@pytest.fixture
+def registry(tmp_path: Path, postgresql_socket: Path) -> Registry:
+    """A registry on PostgreSQL: with SQLite, only the end of the process releases the lock."""
+    url = postgresql.create(postgresql_socket, f"lock_{uuid4().hex}")
+    return registered(Registry.open(Storage(tmp_path / "home", url, tmp_path / "artifacts")), LEAGUE, versions=3)
+
+
 def test_a_holder_that_lost_its_lock_changes_nothing(registry: Registry) -> None:
     other = Registry.open(registry.storage)
     with registry.exclusive_lock("nightly"):
-        promote(registry, 1)
+        with registry.exclusive_lock("snapshots"):  # an inner one does not release the outer one
+            promote(registry, 1)
         terminate_holder(other)
         with other.exclusive_lock("nightly"):
             promote(other, 2)
@@ -65,6 +114,9 @@ def test_a_holder_that_lost_its_lock_changes_nothing(registry: Registry) -> None
                 with pytest.raises(StorageError):
                     promote(registry, 3)
             assert champion(registry) == 2, "reading continues"
+        with ThreadPoolExecutor(1) as thread:  # other threads are unaffected
+            thread.submit(promote, registry, 1).result()
+        assert champion(registry) == 1
     promote(registry, 3)
     assert champion(other) == 3
 
@@ -81,24 +133,3 @@ def test_a_transaction_during_which_the_lock_is_lost_is_rolled_back(registry: Re
     with registry.exclusive_lock("nightly"), pytest.raises(StorageError):
         change()
     assert champion(other) == 1
-
-
-def test_an_inner_lock_does_not_release_the_outer_one(registry: Registry) -> None:
-    other = Registry.open(registry.storage)
-    with registry.exclusive_lock("nightly"):
-        with registry.exclusive_lock("snapshots"):
-            promote(registry, 1)
-        terminate_holder(other)
-        with pytest.raises(StorageError):
-            promote(registry, 2)
-    assert champion(other) == 1
-
-
-def test_other_threads_are_unaffected(registry: Registry) -> None:
-    other = Registry.open(registry.storage)
-    with registry.exclusive_lock("nightly"):
-        terminate_holder(other)
-        thread = threading.Thread(target=promote, args=(registry, 2))
-        thread.start()
-        thread.join()
-    assert champion(registry) == 2

@@ -12,19 +12,22 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import inspect, make_url, select, text
+from sqlalchemy import Connection, inspect, make_url, select, text
 
-from league.errors import ConfigError, StorageError
+from league.errors import StorageError
 from league.registry.registry import Registry
 from league.registry.storage import database, idempotency, migrations
-from league.registry.storage.database import Database
 from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import Portion
 from league.registry.storage.tables import Base
 from league.results.ledger import Ledger
 from league.settings import Storage
+from tests.support.databases import on_both_databases
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
 from tests.support.leagues.registries import LEAGUE, interface, publish
+
+pytestmark = on_both_databases
+
 
 DATA = Path(__file__).parents[4] / "tests" / "data"
 
@@ -33,16 +36,6 @@ DATA = Path(__file__).parents[4] / "tests" / "data"
 def real_migrations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the actual migrations in the tests of this module."""
     monkeypatch.setattr(database, "_apply", unwrap(database._apply))
-
-
-def test_migrations_build_the_tables(empty: Registry) -> None:
-    with empty.database.engine.connect() as connection:
-        context = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(context, Base.metadata) == []
-        # compare_metadata ignores the condition of a partial index.
-        indexes = {index["name"]: index for index in inspect(connection).get_indexes("versions")}
-        where = indexes["uq_versions_ready_source"]["dialect_options"]
-    assert any("state" in str(condition) and "ready" in str(condition) for condition in where.values())
 
 
 def test_known_revisions_are_those_of_the_directory() -> None:
@@ -59,20 +52,6 @@ def test_concurrent_opening_migrates_once(storage: Storage) -> None:
     for registry in registries:
         assert registry.leagues.names() == {}
         registry.close()
-
-
-def test_reopening_keeps_the_data(registry: Registry, storage: Storage) -> None:
-    again = Registry.open(storage)
-    assert again.leagues.names() == registry.leagues.names()
-    again.close()
-
-
-def test_the_schema_of_another_release_is_rejected(empty: Registry, storage: Storage) -> None:
-    with empty.database.engine.connect() as connection:
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
-        connection.commit()
-    with pytest.raises(StorageError, match="9999 of another release"):
-        Registry.open(storage)
 
 
 def test_a_failed_migration_is_rolled_back(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,8 +90,7 @@ def restored(storage: Storage) -> Registry:
 def test_a_database_of_version_0_1_0_is_migrated_to_the_tables(storage: Storage) -> None:
     with closing(restored(storage)) as registry, registry.database.engine.connect() as connection:
         assert database.revision(connection) == migrations.HEAD
-        context = MigrationContext.configure(connection, opts={"compare_type": True})
-        assert compare_metadata(context, Base.metadata) == []
+        assert differences(connection) == []
         empty = [
             table.name for table in Base.metadata.sorted_tables if connection.execute(select(table)).first() is None
         ]
@@ -183,29 +161,19 @@ def test_a_registry_of_version_0_1_0_continues(storage: Storage, monkeypatch: py
         assert registry.training_nights.open(LEAGUE).number == 2
 
 
-@pytest.mark.parametrize(
-    ("url", "message"),
-    [
-        ("mysql://host/league", "names 'mysql': expected sqlite or postgresql"),
-        ("no url at all: secret", "LEAGUE_DATABASE_URL is not a URL: expected sqlite"),
-        ("sqlite://", "does not name a file"),
-        ("sqlite:///:memory:", "does not name a file"),
-    ],
-)
-def test_an_unsupported_url_is_reported(url: str, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        Database(url)
+def differences(connection: Connection) -> list[object]:
+    """From the tables of the classes."""
+    return list(compare_metadata(MigrationContext.configure(connection, opts={"compare_type": True}), Base.metadata))
 
 
-def test_an_unreachable_server_is_reported_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(StorageError) as caught:
-        Database(f"postgresql://somebody:secret@/league?host={tmp_path}")
-    assert "\n" not in str(caught.value)
-    assert "secret" not in str(caught.value)
-
-
-def test_a_file_that_is_not_a_database_is_reported_in_one_line(tmp_path: Path) -> None:
-    storage = Storage.at(tmp_path)
-    (tmp_path / "league.db").write_text("these are not the bytes of a database, however long they go on " * 100)
-    with pytest.raises(StorageError, match=r"league\.db cannot be used: file is not a database"):
+def test_migrations_build_the_tables(empty: Registry, storage: Storage) -> None:
+    with empty.database.engine.connect() as connection:
+        assert differences(connection) == []
+        # compare_metadata ignores the condition of a partial index.
+        indexes = {index["name"]: index for index in inspect(connection).get_indexes("versions")}
+        where = indexes["uq_versions_ready_source"]["dialect_options"]
+        assert any("state" in str(condition) and "ready" in str(condition) for condition in where.values())
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+        connection.commit()
+    with pytest.raises(StorageError, match="9999 of another release"):
         Registry.open(storage)

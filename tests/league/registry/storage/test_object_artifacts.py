@@ -1,5 +1,7 @@
 """An object store: its cache, its errors, and publishers that are killed."""
 
+import hashlib
+import os
 import signal
 import subprocess
 import sys
@@ -10,7 +12,7 @@ import pytest
 from league.errors import ConfigError, FilesMissing, LeagueError, StorageError
 from league.registry.registry import Registry
 from league.registry.storage import object_artifacts
-from league.registry.storage.object_artifacts import ObjectArtifactStore
+from league.registry.storage.object_artifacts import DigestCache, ObjectArtifactStore
 from league.settings import Storage
 from tests.support.leagues.registries import GRAPH, LEAGUE, publish, registered
 from tests.support.servers import object_store
@@ -39,33 +41,10 @@ def test_a_version_without_objects_is_reported(bucket: str, remote: Registry) ->
         remote.artifacts.check_exists(LEAGUE, 1)
 
 
-def test_an_unreachable_store_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in object_store.variables("http://127.0.0.1:9").items():
-        monkeypatch.setenv(name, value)
-    _reports(ObjectArtifactStore("s3://bucket/prefix", tmp_path), "cannot be used: check network")
-
-
-def test_a_missing_bucket_is_reported(bucket: str, tmp_path: Path) -> None:
-    _reports(ObjectArtifactStore("s3://no-such-bucket/prefix", tmp_path), "the bucket does not exist: create it")
-
-
-def test_a_reachable_store_is_writable_and_stays_empty(bucket: str, tmp_path: Path) -> None:
-    ObjectArtifactStore(bucket, tmp_path).check_writable()
-    assert object_store.keys(bucket) == []
-
-
 def test_without_obstore_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "obstore.store", None)
     with pytest.raises(ConfigError, match=r"pip install 'policy-league\[object-store\]'"):
         ObjectArtifactStore("s3://bucket/prefix", tmp_path)
-
-
-def _reports(store: ObjectArtifactStore, message: str) -> None:
-    for call in (store.check_writable, lambda: store.last(LEAGUE), lambda: store._get("a/1/b")):
-        with pytest.raises(StorageError, match=message) as caught:
-            call()
-        assert "\n" not in str(caught.value)
-        assert "s3://" in str(caught.value)
 
 
 KILLED = """
@@ -106,36 +85,67 @@ def test_a_killed_publisher_leaves_no_version(remote: Registry, bucket: str, poi
     assert {key.split("/")[1] for key in object_store.keys(bucket)} == {"2"}
 
 
-def test_refused_credentials_are_reported(bucket: str, tmp_path: Path, s3_endpoint: str) -> None:
-    with object_store.refusing_credentials(s3_endpoint):
-        _reports(ObjectArtifactStore(bucket, tmp_path), "refuses the credentials: renew them")
-
-
-@pytest.mark.parametrize("code", object_artifacts.EXPIRED)
-def test_expired_credentials_are_reported(bucket: str, tmp_path: Path, code: str) -> None:
-    from obstore.exceptions import GenericError, PermissionDeniedError
-
-    store = ObjectArtifactStore(bucket, tmp_path)
-    for error, message in ((GenericError(code), "expired: renew"), (PermissionDeniedError("403"), "refuses the cred")):
-        with pytest.raises(LeagueError, match=message), store._errors():
-            raise error
-
-
-@pytest.mark.parametrize(
-    ("url", "store"),
-    [
-        ("s3://bucket/prefix", "S3Store"),
-        ("gs://bucket/prefix", "GCSStore"),
-        ("az://container/prefix", "AzureStore"),
-    ],
-)
-def test_each_kind_of_store_is_opened(url: str, store: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "account")
-    opened = object_artifacts._connect(url)
-    assert (type(opened).__name__, opened.prefix) == (store, "prefix")
-
-
-def test_azure_needs_an_account(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_kind_of_store_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME", raising=False)
     with pytest.raises(ConfigError, match=r"LEAGUE_ARTIFACTS=az://container is invalid: .*Account must be specified"):
         object_artifacts._connect("az://container")
+    monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "account")
+    for scheme, store in (("s3", "S3Store"), ("gs", "GCSStore"), ("az", "AzureStore")):
+        opened = object_artifacts._connect(f"{scheme}://bucket/prefix")
+        assert (type(opened).__name__, opened.prefix) == (store, "prefix")
+
+
+def test_a_file_is_fetched_once_unless_it_is_damaged(tmp_path: Path) -> None:
+    cache, digest, fetched = DigestCache(tmp_path), _digest(b"graph"), iter([b"other", b"graph", b"graph"])
+    assert cache.read(digest, lambda: next(fetched)) == b"other"
+    assert list(tmp_path.iterdir()) == [], "content with another digest is not cached"
+    assert [cache.read(digest, lambda: next(fetched)) for _ in range(2)] == [b"graph", b"graph"]
+    (tmp_path / digest).write_bytes(b"damaged")
+    assert cache.read(digest, lambda: next(fetched)) == b"graph"
+    assert (tmp_path / digest).read_bytes() == b"graph"
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def test_the_oldest_files_are_removed_beyond_the_limit(tmp_path: Path) -> None:
+    cache, contents = DigestCache(tmp_path, limit=20), [bytes([i]) * 10 for i in range(3)]
+    for i, content in enumerate(contents[:2]):
+        cache.read(_digest(content), lambda content=content: content)  # type: ignore[misc]
+        os.utime(tmp_path / _digest(content), (i, i))
+    cache.read(_digest(contents[2]), lambda: contents[2])
+    assert {path.name for path in tmp_path.iterdir()} == {_digest(content) for content in contents[1:]}
+
+
+def test_a_store_that_cannot_be_used_is_reported(
+    bucket: str, tmp_path: Path, s3_endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = ObjectArtifactStore(bucket, tmp_path)
+    store.check_writable()
+    assert object_store.keys(bucket) == [], "it stays empty"
+    missing = ObjectArtifactStore("s3://no-such-bucket/prefix", tmp_path)
+    _assert_reports(missing, "the bucket does not exist: create it")
+    with object_store.refusing_credentials(s3_endpoint):
+        _assert_reports(store, "refuses the credentials: renew them")
+    for name, value in object_store.variables("http://127.0.0.1:9").items():
+        monkeypatch.setenv(name, value)
+    _assert_reports(ObjectArtifactStore("s3://bucket/prefix", tmp_path), "cannot be used: check network")
+
+
+def _assert_reports(store: ObjectArtifactStore, message: str) -> None:
+    for call in (store.check_writable, lambda: store.last(LEAGUE), lambda: store._get("a/1/b")):
+        with pytest.raises(StorageError, match=message) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+        assert "s3://" in str(caught.value)
+
+
+def test_expired_credentials_are_reported(bucket: str, tmp_path: Path) -> None:
+    from obstore.exceptions import GenericError, PermissionDeniedError
+
+    store = ObjectArtifactStore(bucket, tmp_path)
+    errors = [*((GenericError(code), "expired: renew") for code in object_artifacts.EXPIRED)]
+    for error, message in (*errors, (PermissionDeniedError("403"), "refuses the cred")):
+        with pytest.raises(LeagueError, match=message), store._errors():
+            raise error

@@ -13,37 +13,34 @@ from tests.support.leagues.registries import LEAGUE, publish
 
 
 @pytest.fixture
-def records(local: Registry) -> dict[type[Record], Record]:
+def records(registry: Registry) -> dict[type[Record], Record]:
     """A record that was read, and records that were created."""
-    publish(local, "run/1000")
-    event = local.aliases.set(LEAGUE, "champion", 1, expected=None, actor="ada", reason="test")
-    run = local.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=1, target=9)
-    key, _ = local.keys.create("ci", ["read"])
-    found = [local.leagues.get(LEAGUE), event, run, key, local.nightly_runs.open(LEAGUE, [1], 0.1)]
+    publish(registry, "run/1000")
+    event = registry.aliases.set(LEAGUE, "champion", 1, expected=None, actor="ada", reason="test")
+    run = registry.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=1, target=9)
+    key, _ = registry.keys.create("ci", ["read"])
+    found = [registry.leagues.get(LEAGUE), event, run, key, registry.nightly_runs.open(LEAGUE, [1], 0.1)]
     return {type(record): record for record in found}
 
 
-def test_records_are_immutable_after_their_transaction(records: dict[type[Record], Record]) -> None:
+def test_records_are_immutable_after_their_transaction(records: dict[type[Record], Record], registry: Registry) -> None:
     for record in records.values():
         assert inspect(record).detached
         for name in (field.name for field in fields(record)):
             with pytest.raises(FrozenInstanceError, match=f"{name} of {type(record).__name__} cannot be set"):
                 setattr(record, name, None)
-
-
-def test_equal_rows_are_equal_records(records: dict[type[Record], Record], local: Registry) -> None:
-    (key,) = local.keys.all()
+    (key,) = registry.keys.all()
     assert key == records[KeyRow]
     assert key != replace(key, expires_at=datetime.now(UTC))
-    assert local.runs.get(LEAGUE, "run") == records[RunRow]
+    assert registry.runs.get(LEAGUE, "run") == records[RunRow]
 
 
-def test_the_record_of_a_run_is_read_only_where_it_is_needed(local: Registry) -> None:
-    local.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=1, target=9, record={"pins": {}})
-    local.runs.begin(LEAGUE, "other", algorithm="ppo", settings={}, seed=1, target=9)
+def test_the_record_of_a_run_is_read_only_where_it_is_needed(registry: Registry) -> None:
+    registry.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=1, target=9, record={"pins": {}})
+    registry.runs.begin(LEAGUE, "other", algorithm="ppo", settings={}, seed=1, target=9)
     with pytest.raises(DetachedInstanceError):
-        _ = local.runs.get(LEAGUE, "run").record
-    assert [(run.id, run.record) for run in local.runs.stored(LEAGUE)] == [("run", {"pins": {}})]
+        _ = registry.runs.get(LEAGUE, "run").record
+    assert [(run.id, run.record) for run in registry.runs.stored(LEAGUE)] == [("run", {"pins": {}})]
 
 
 def test_a_run_is_silent_without_heartbeats(records: dict[type[Record], Record]) -> None:

@@ -1,5 +1,8 @@
-"""Training runs in the registry: their states, and a limited number of points per run."""
+"""Training runs in the registry: their states, a limited number of points per run, the strength of their versions, and
+nights of training.
+"""
 
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 
@@ -8,9 +11,9 @@ from sqlalchemy import update
 
 from league.errors import InvalidInput, UnknownLeague, UnknownRun
 from league.registry.registry import Registry
-from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunPoint, RunRow
+from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunPoint, RunRow, StrengthRow
 from league.registry.training import runs
-from tests.support.leagues.registries import LEAGUE
+from tests.support.leagues.registries import LEAGUE, publish, registered
 
 SETTINGS = {"algorithm": "ppo", "lr": 3e-4}
 
@@ -61,13 +64,6 @@ def test_a_run_begins_records_points_and_ends(registry: Registry) -> None:
     assert registry.runs.counts() == {}
 
 
-def test_the_error_of_a_failed_run_is_stored(registry: Registry) -> None:
-    begin(registry)
-    registry.runs.end(LEAGUE, "first", "failed", "the board is gone")
-    row = registry.runs.get(LEAGUE, "first")
-    assert (row.state, row.error) == ("failed", "the board is gone")
-
-
 def test_a_run_without_heartbeat_is_silent_until_the_next_one(registry: Registry) -> None:
     begin(registry)
     expire_heartbeats(registry)
@@ -85,34 +81,33 @@ def test_a_resumed_run_drops_the_points_after_its_checkpoint(registry: Registry)
     for steps in (100, 200, 300):
         record(registry, steps)
     registry.runs.end(LEAGUE, "first", "failed", "power cut")
+    row = registry.runs.get(LEAGUE, "first")
+    assert (row.state, row.error) == ("failed", "power cut")
     resumed = begin(registry, steps=200)
     assert (resumed.state, resumed.error, resumed.ended_at, resumed.attempts) == ("running", None, None, 2)
     assert (resumed.steps, resumed.began_at) == (200, started.began_at)
     assert steps_of(registry) == [100, 200]
-    record(registry, 250)
+    for loss in (1.0, 2.0):  # a point that is recorded again replaces the first
+        record(registry, 250, loss=loss)
     assert steps_of(registry) == [100, 200, 250]
+    assert registry.runs.points(LEAGUE, "first")[-1].curves == {"loss": 2.0}
 
 
 @pytest.mark.parametrize("jitter", [0, 3])
-def test_points_are_spread_evenly_over_the_run(local: Registry, jitter: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_are_spread_evenly_over_the_run(
+    registry: Registry, jitter: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(runs, "MAX_POINTS", 21)
-    begin(local)
+    begin(registry)
     for number in range(150):
         newest = 10 * number + number % 2 * jitter
-        record(local, newest)
-        kept = steps_of(local)
+        record(registry, newest)
+        kept = steps_of(registry)
         assert len(kept) < 21
         assert (kept[0], kept[-1]) == (0, newest), "the first and the newest point are kept"
     assert len(kept) >= 10
     gaps = {later - earlier for earlier, later in pairwise(kept[:-1])}
     assert max(gaps) <= 2 * min(gaps), f"uneven gaps: {gaps}"
-
-
-def test_a_point_recorded_again_replaces_the_first(registry: Registry) -> None:
-    begin(registry)
-    record(registry, 100, loss=1.0)
-    record(registry, 100, loss=2.0)
-    assert [(point.steps, point.curves) for point in registry.runs.points(LEAGUE, "first")] == [(100, {"loss": 2.0})]
 
 
 def test_runs_are_listed_newest_first(registry: Registry) -> None:
@@ -134,3 +129,46 @@ def test_unknown_leagues_and_runs_are_reported(registry: Registry) -> None:
             call(LEAGUE, "first")
     with pytest.raises(UnknownLeague):
         registry.runs.newest("chess")
+
+
+def test_nights_are_numbered_within_their_league(registry: Registry) -> None:
+    registered(registry, "chess")
+    for league in (LEAGUE, "chess", LEAGUE):
+        opened = registry.training_nights.open(league)
+        assert registry.training_nights.open(league) == opened, "the night that is open"
+        closed = registry.training_nights.close(opened.id)
+        assert closed.number == opened.number
+    nights = registry.training_nights.all(LEAGUE)
+    assert [night.number for night in nights] == [1, 2]
+    assert [night.id for night in nights] == [1, 3]
+    assert closed == nights[-1]
+    assert [night.number for night in registry.training_nights.all("chess")] == [1]
+
+
+ROW = StrengthRow(
+    league=LEAGUE,
+    version=1,
+    opponent="script:random",
+    run="first",
+    steps=512,
+    games=200,
+    score=0.75,
+    low=0.68,
+    high=0.81,
+    at=datetime(2026, 11, 24, tzinfo=UTC),
+)
+
+
+def test_scores_are_read_by_run_in_the_order_of_the_versions(registry: Registry) -> None:
+    for run in ("first/1", "first/2", "second/1"):
+        publish(registry, run)
+    later, other = replace(ROW, version=2, steps=1024), replace(ROW, version=3, run="second")
+    for row in (later, ROW, other, replace(ROW, score=0.1)):
+        registry.strength.record([row])
+    assert registry.strength.of_run(LEAGUE, "first") == [ROW, later], "a repeated measurement keeps the first score"
+    assert registry.strength.of_run(LEAGUE, "second") == [other]
+    registry.strength.record([replace(other, opponent="script:one_ply")])
+    assert len(registry.strength.of_run(LEAGUE, "second")) == 2
+    assert registry.strength.of_run(LEAGUE, "third") == []
+    with pytest.raises(UnknownLeague, match="chess"):
+        registry.strength.of_run("chess", "first")

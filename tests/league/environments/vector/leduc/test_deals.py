@@ -1,14 +1,17 @@
 from collections import Counter
+from collections.abc import Callable
 from math import factorial
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rlcard.games.leducholdem import Game
 from rlcard.utils import seeding
 
 from league.environments.vector.leduc import deals
-from league.environments.vector.leduc.deals import EQUALLY_PROBABLE, Deals, deal, fast_deal
+from league.environments.vector.leduc.deals import EQUALLY_PROBABLE, Deals, Generators, deal, fast_deal, outputs
 from league.random import splitmix64
 
 RANKS = "JQK"
@@ -29,13 +32,6 @@ def test_deals_equal_rlcards() -> None:
     assert np.array_equal(np.transpose(deal(seeds)), [rlcards_deal(int(seed)) for seed in seeds])
 
 
-def test_a_deal_depends_on_its_own_seed_only() -> None:
-    seeds = np.arange(100)
-    together = np.transpose(deal(seeds))
-    assert np.array_equal(together, np.concatenate([np.transpose(deal(seeds[i : i + 1])) for i in seeds]))
-    assert np.array_equal(together[::-1], np.transpose(deal(seeds[::-1])))
-
-
 class AllDraws:
     """Generators whose draws are the digits of their seeds: consecutive seeds have all combinations, once each."""
 
@@ -45,10 +41,6 @@ class AllDraws:
     def integers(self, highest: int) -> NDArray[np.int64]:
         self._digits, digit = np.divmod(self._digits, highest + 1)
         return digit
-
-
-def counts(dealt: Deals) -> Counter[tuple[int, ...]]:
-    return Counter(tuple(hand) for hand in np.transpose(dealt).tolist())
 
 
 def test_fast_deals_have_exactly_the_distribution_of_the_stock_deals(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,7 +53,33 @@ def test_fast_deals_have_exactly_the_distribution_of_the_stock_deals(monkeypatch
     assert stock == {hand: count * shuffles // outcomes for hand, count in fast.items()}
 
 
-def test_a_fast_deal_depends_on_its_own_seed_only() -> None:
-    seeds = np.array([5, 0, 2**31 - 1, 7])
-    together = np.transpose(fast_deal(seeds)).tolist()
-    assert together == [np.transpose(fast_deal(seeds[i : i + 1])).tolist()[0] for i in range(4)]
+SEEDS = st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=5)
+
+
+@given(SEEDS, st.integers(1, 700))
+@example([0, 1, 2**31 - 1], 700)
+def test_outputs_equal_those_of_rlcards_generators(seeds: list[int], count: int) -> None:
+    expected = [seeding.np_random(seed)[0].randint(0, 2**32, size=count, dtype=np.uint32) for seed in seeds]
+    assert np.array_equal(outputs(np.array(seeds), count), expected)
+
+
+@pytest.mark.parametrize("deal_cards", [deal, fast_deal])
+def test_a_deal_depends_on_its_own_seed_only(deal_cards: Callable[[NDArray[np.int64]], Deals]) -> None:
+    seeds = np.array([5, 0, 2**31 - 1, *range(90)])
+    together = np.transpose(deal_cards(seeds)).tolist()
+    assert together == [np.transpose(deal_cards(np.array([seed]))).tolist()[0] for seed in seeds]
+
+
+def counts(dealt: Deals) -> Counter[tuple[int, ...]]:
+    return Counter(tuple(hand) for hand in np.transpose(dealt).tolist())
+
+
+@given(SEEDS | st.just([]), st.lists(st.integers(1, 1000), max_size=20), st.sampled_from([1, 3, 7, deals.NUM_OUTPUTS]))
+def test_draws_equal_those_of_rlcards_generators(seeds: list[int], highest: list[int], num_outputs: int) -> None:
+    """However many outputs are computed at first."""
+    states = [seeding.np_random(seed)[0] for seed in seeds]
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(deals, "NUM_OUTPUTS", num_outputs)
+        drawing = Generators(np.array(seeds, np.int64))
+        for most in highest:
+            assert drawing.integers(most).tolist() == [state.randint(0, most + 1) for state in states]
