@@ -1,13 +1,21 @@
-"""Targets, recorded results and the page of them."""
+"""Targets, recorded results and the page of them; the entry of all benchmarks; faults that are injected."""
 
+import ast
+import inspect
 import math
 import runpy
+import subprocess
+import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from benchmarks import __main__ as entry
 from benchmarks import harness
 from benchmarks.harness import Run, Target, chosen, in_rounds, record, recorded, write
+from benchmarks.mutants import mutants
 
 PAGE = runpy.run_path("scripts/benchmark_page.py")["page"]
 
@@ -73,3 +81,62 @@ def test_parts_are_all_or_those_that_are_named() -> None:
     parts = {"a": 1, "b": 2}
     assert chosen(None, parts) == parts
     assert chosen(["b"], parts) == {"b": 2}
+
+
+HEAVY = {"formats", "pages", "fuzz", "hostile", "exploitability", "training_nights", "exploiters"}
+"""Their imports need packages that only some tests have, or take long."""
+
+
+def test_every_benchmark_is_listed_and_has_a_quick_form(subtests: pytest.Subtests) -> None:
+    listed = CliRunner().invoke(entry.app, ["--help"]).output
+    assert [name for name in [*entry.names(), "all"] if f"  {name} " not in listed] == []
+    for name in sorted(set(entry.names()) - HEAVY):
+        with subtests.test(name):
+            module = import_module(f"benchmarks.{name}")
+            assert inspect.signature(module.main).parameters["quick"].default is False
+            assert module.__doc__
+
+
+def test_an_unknown_part_is_refused() -> None:
+    result = CliRunner().invoke(entry.app, ["phases", "chess"])
+    assert result.exit_code == 2
+    assert "no part chess: expected some of leduc_holdem_dqn" in result.output
+
+
+def test_a_missed_target_ends_with_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    met, missed = Target("rate", 1.2, "×", at_least=1.0, peer="a"), Target("wait", (0.1, 3.0), "s", at_most=1)
+    entry.report(iter([met]), save=False)
+    with pytest.raises(entry.typer.Exit):
+        entry.report(iter([met, missed]), save=False)
+    assert "wait: 0.1, 3 s   (target ≤1 s: MISSED)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("source", "after"),
+    [
+        ("a < b", ["(a <= b)"]),
+        ("a and not b", ["(a or not b)", "bool(b)"]),
+        ("é = '–' or x + 1", ["('–' and x + 1)", "(x - 1)", "2"]),
+        ("f(True)", ["pass", "False"]),
+        ("def f(a: int = 1) -> int:\n    '''One.'''\n    return a", ["2", "return None"]),
+        ("def f(a: Literal[1]) -> Literal[2]:\n    pass", []),
+        ("if TYPE_CHECKING:\n    import a\n    b = 1", []),
+    ],
+)
+def test_every_fault_of_a_module_is_a_module(source: str, after: list[str]) -> None:
+    faults = list(mutants("a.py", source))
+    assert sorted(fault.after for fault in faults) == sorted(after)
+    for fault in faults:
+        mutant = (source.encode()[: fault.start] + fault.after.encode() + source.encode()[fault.end :]).decode()
+        ast.parse(mutant)
+        assert mutant != source
+        assert source.encode()[fault.start : fault.end].decode() == fault.before
+
+
+@pytest.mark.slow
+def test_the_quick_form_finds_no_partial_version_and_few_bytes() -> None:
+    command = [sys.executable, "-m", "benchmarks", "object_store", "--quick"]
+    process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200)
+    lines = dict(line.partition(": ")[::2] for line in process.stdout.splitlines())
+    assert lines["partial versions visible"].startswith("0 "), process.stderr
+    assert float(lines["received for a version of 1 MB"].split()[0]) <= 2

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.errors import InvalidReference
+from league.errors import InvalidReference, NotFound, from_document, last_line, one_line, to_document
 from league.refs import CheckpointRef, PolicyRef, ScriptRef, check_alias, check_slug, parse_ref
 
 slugs = st.from_regex(r"[a-z0-9_-]{1,100}", fullmatch=True)
@@ -52,3 +52,19 @@ def test_invalid_references_are_rejected() -> None:
     assert check_alias("candidate") == "candidate"
     with pytest.raises(InvalidReference, match="version number"):
         check_alias("12")
+
+
+def test_an_error_keeps_its_type_as_data() -> None:
+    document = to_document(NotFound("no such league"))
+    assert document == {"code": "not_found", "message": "no such league"}
+    error = from_document(document)
+    assert type(error) is NotFound
+    assert str(error) == "no such league"
+
+
+def test_an_error_is_one_line() -> None:
+    error = ValueError("two\n  lines")
+    assert (one_line(error), one_line(error, with_type=True)) == ("two lines", "ValueError: two lines")
+    assert one_line(TimeoutError()) == one_line(TimeoutError(), with_type=True) == "TimeoutError"
+    assert one_line(ValueError("the  first\nthe second"), with_type=True, first_line=True) == "ValueError: the first"
+    assert [last_line(text) for text in ("first\n second \n\n", "\n", "")] == ["second", "", ""]

@@ -1,11 +1,17 @@
+import tomllib
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+import policy_league_client
+from league import client
+from league.client import pettingzoo
 from league.errors import ConfigError
 from league.registry.registry import Registry
 from league.settings import Storage
+from league.stack import VERIFIED, installed
+from policy_league_client.pettingzoo import play
 
 SERVER = "postgresql://db/league"
 
@@ -56,3 +62,31 @@ def test_a_password_in_the_url_is_noticed() -> None:
         ("postgresql://db/league?user=league&password=secret", True),
     ):
         assert Storage(Path("/home"), url, Path("/artifacts")).has_password is has_password
+
+
+def test_the_verified_stack_equals_the_constraints() -> None:
+    lines = Path("constraints.txt").read_text().splitlines()
+    pins = dict(line.lower().split("==") for line in lines if "==" in line)
+    assert {package: pins.get(package) for package in VERIFIED} == VERIFIED
+
+
+def test_build_dependencies_are_pinned() -> None:
+    """pip installs them in an environment of its own, without the constraints."""
+    required = tomllib.loads(Path("pyproject.toml").read_text())["build-system"]["requires"]
+    assert set(required) <= set(Path("constraints.txt").read_text().splitlines())
+
+
+def test_the_tests_run_on_the_verified_stack() -> None:
+    assert {name: version.partition("+")[0] for name, version in installed().items()} == VERIFIED
+
+
+def test_the_client_is_available_under_both_names() -> None:
+    assert [getattr(client, name) for name in policy_league_client.__all__] == [
+        getattr(policy_league_client, name) for name in policy_league_client.__all__
+    ]
+    assert pettingzoo.play is play
+
+
+def test_an_unknown_name_of_the_client_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'policy_league_client' has no attribute 'Klient'"):
+        policy_league_client.Klient  # noqa: B018

@@ -1,12 +1,21 @@
+"""Gateways are found while they are announced."""
+
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
+from datetime import timedelta
 
 import pytest
 
+from league.errors import UnknownLeague
+from league.registry import gateways
+from league.registry.gateways import Gateway
 from league.registry.processes import has_ended, host_name, is_local, this_process
+from league.registry.registry import Registry
+from tests.support.leagues.registries import LEAGUE
 
 PROGRAM = "from league.registry.processes import this_process; print(this_process(), flush=True); input()"
 
@@ -50,3 +59,25 @@ def test_nothing_is_known_of_processes_on_other_machines() -> None:
     assert not is_local(elsewhere)
     assert not has_ended(elsewhere)
     assert host_name(elsewhere) == "trainer-7"
+
+
+TRAINING = Gateway("http://127.0.0.1:4001", "a", LEAGUE, "training", simulators=2)
+
+
+EVALUATION = Gateway("http://127.0.0.1:4002", "b", LEAGUE, "evaluation", simulators=2, waiting=7)
+
+
+def test_gateways_are_found_until_they_close(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    for gateway in (TRAINING, EVALUATION):
+        registry.gateways.announce(gateway)
+    assert registry.gateways.open(LEAGUE) == [EVALUATION, TRAINING], "an evaluation comes first"
+    lonely = replace(TRAINING, simulators=0)
+    registry.gateways.announce(lonely)
+    assert registry.gateways.open(LEAGUE) == [lonely, EVALUATION], "those with fewer simulators come first"
+    assert registry.gateways.open("another") == []
+    registry.gateways.close(EVALUATION)
+    assert registry.gateways.open(LEAGUE) == [lonely]
+    with pytest.raises(UnknownLeague):
+        registry.gateways.announce(replace(TRAINING, league="another"))
+    monkeypatch.setattr(gateways, "SILENCE", timedelta(0))
+    assert registry.gateways.open(LEAGUE) == [], "its process has died"

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, EPISODE_MODULE_RETURN_MEAN, EPISODE_RETURN_MEAN, LEARNER_RESULTS
 
 from league.config.algorithms import GROUP, IMPORTED, OwnSettings
 from league.config.league import LeagueConfig
@@ -11,6 +12,7 @@ from league.environments.building import interface
 from league.errors import ConfigError
 from policy_league.configs import bundled
 from tests.support.leagues.training_leagues import counting, tictactoe
+from training.algorithms.metrics import OFF_POLICY_METRICS, PPO_METRICS, training_metrics
 from training.algorithms.rllib_config import (
     algorithm_config,
     check_opponents,
@@ -157,3 +159,15 @@ def test_an_installed_algorithm_has_a_name(tmp_path: Path, monkeypatch: pytest.M
     training = {"algorithm": "bonus"}
     league = LeagueConfig.from_mapping({"league": "own", "environment": {"entry_point": "a:b"}, "training": training})
     assert league.training.algorithm == "algorithm_of_test:Bonus"
+
+
+def test_an_update_without_finished_episodes_has_no_returns() -> None:
+    """RLlib reports NaN for metrics without new values; a NaN loss means divergence and is kept."""
+    result: dict[str, Any] = {
+        ENV_RUNNER_RESULTS: {EPISODE_RETURN_MEAN: float("nan"), EPISODE_MODULE_RETURN_MEAN: {"shared": float("nan")}},
+        LEARNER_RESULTS: {"shared": {"policy_loss": float("nan"), "loss": 2.0}},
+    }
+    found = training_metrics(result, interface(tictactoe()), PPO_METRICS | OFF_POLICY_METRICS)
+    assert found.keys() == {"shared/policy_loss", "shared/loss"}
+    result[ENV_RUNNER_RESULTS][EPISODE_RETURN_MEAN] = 1.5
+    assert training_metrics(result, interface(tictactoe()))["return"] == 1.5

@@ -2,6 +2,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,13 +10,16 @@ from numpy.typing import NDArray
 from league.config.environment import EnvironmentConfig
 from league.environments.building import agent_interface, build
 from league.environments.implementation import VECTORISED, implementation
+from league.environments.stepping import legal_rows
 from league.environments.vector.connect_four import ConnectFour
 from league.environments.vector.copying import Twins
 from league.environments.vector.differences import EnvironmentsDiffer
+from league.environments.vector.random_actions import random_actions
 from league.environments.vector.tictactoe import TicTacToe
 from league.environments.vector.vector_env import AgentRows
 from league.errors import ObservationError
 from league.spaces import Discrete
+from league.spaces.conversion import from_gymnasium
 
 
 def twins(config: EnvironmentConfig) -> Twins:
@@ -108,3 +112,41 @@ def board(game: type[TicTacToe] | type[ConnectFour], own: list[int], other: list
     planes = np.zeros((shape[0] * shape[1], 2), dtype=np.int8)
     planes[own, 0] = planes[other, 1] = 1
     return planes.reshape(1, *shape)
+
+
+SPACES = {
+    "discrete": gymnasium.spaces.Discrete(5),
+    "from 3": gymnasium.spaces.Discrete(5, start=3),
+    "several choices": gymnasium.spaces.MultiDiscrete([2, 3]),
+    "binary": gymnasium.spaces.MultiBinary(4),
+    "box": gymnasium.spaces.Box(-1, 2, (2, 2), np.float32),
+    "half a box": gymnasium.spaces.Box(np.array([0, -np.inf]), np.array([1, np.inf]), dtype=np.float64),
+}
+
+
+def test_all_legal_actions_are_equally_probable() -> None:
+    mask = np.tile(np.array([0, 1, 1, 0, 1], dtype=np.int8), (30_000, 1))
+    counts = np.bincount(random_actions(from_gymnasium(SPACES["discrete"]), 30_000, mask, np.random.default_rng(0)))
+    assert counts[[0, 3]].tolist() == [0, 0]
+    # Six standard deviations of a binomial distribution.
+    assert (abs(counts[[1, 2, 4]] - 10_000) < 6 * np.sqrt(30_000 * 2 / 9)).all()
+
+
+def test_actions_are_in_the_space_and_differ(subtests: pytest.Subtests) -> None:
+    for name, space in SPACES.items():
+        with subtests.test(name):
+            actions = random_actions(from_gymnasium(space), 200, None, np.random.default_rng(0))
+            assert len(actions) == 200
+            assert actions.dtype == space.dtype
+            assert all(space.contains(action) for action in actions)
+            assert len(np.unique(actions, axis=0)) > 3
+            assert name != "box" or {-1.0, 2.0} <= set(actions.ravel().tolist()), "some elements are at the bounds"
+
+
+def test_masked_actions_are_legal() -> None:
+    rng = np.random.default_rng(0)
+    for name in ("discrete", "from 3", "several choices"):
+        mask = (rng.random((300, 5)) < 0.4).astype(np.int8)
+        mask[:, [0, 2]] = 1  # at least one choice for each element
+        space = from_gymnasium(SPACES[name])
+        assert legal_rows(random_actions(space, 300, mask, rng), space, mask).all()
