@@ -1,5 +1,6 @@
 """A real server with Ray Serve, HAProxy and two replicas, under load, promotions and faults, in all protocols."""
 
+import json
 import os
 import re
 import signal
@@ -18,8 +19,10 @@ import psutil
 import pytest
 import tritonclient.grpc
 from filelock import FileLock
+from ray.serve._private.constants import SERVE_HTTP_REQUEST_ID_HEADER
 from tritonclient.utils import InferenceServerException
 from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from evaluation.documents import EvaluationReport
 from evaluation.matches.tournament import evaluate
@@ -85,6 +88,35 @@ def test_replicas_have_the_priority_of_the_server(served: Registry) -> None:
     until(lambda: len(processes(served.storage, "PolicyServer")) == 2)  # one of them may be replaced
     priorities = {os.getpriority(os.PRIO_PROCESS, pid) for pid in processes(served.storage, "PolicyServer")}
     assert priorities == {os.getpriority(os.PRIO_PROCESS, 0)}
+
+
+@pytest.mark.e2e
+@pytest.mark.e2e
+def test_actions_bypass_ray_serve_and_its_protocols(url: str) -> None:
+    with httpx.Client(base_url=url, trust_env=False) as client:
+
+        def act() -> httpx.Response:
+            return client.post(ACTION, json={"observation": BOARD})
+
+        # Until HAProxy knows the replicas, Ray Serve's proxy answers, without our protocols.
+        until(lambda: "x-request-id" not in act().headers, seconds=120)
+        assert client.get("/-/routes").json() == {"/": "policy-league"}, "Ray Serve answers its own paths"
+        assert SERVE_HTTP_REQUEST_ID_HEADER == "x-request-id", "Ray Serve marks the responses that it handles"
+        for method, path, body in (
+            ("POST", ACTION, {"observation": BOARD}),
+            ("POST", "/v2/models/board/infer", {"inputs": []}),
+            ("GET", "/v1/leagues", None),
+            ("GET", "/v1/health/live", None),
+        ):
+            direct = client.request(method, path, json=body)
+            assert direct.headers["content-type"] == "application/json"
+            assert "x-request-id" not in direct.headers, f"{path} does not bypass Ray Serve: see serve_bypass.py"
+    address = url.replace("http://", "ws://") + "/v1/policies/board/stream"
+    with connect(address, proxy=None) as stream:  # offers compression, which uvicorn's own protocol accepts
+        assert stream.response is not None
+        assert "sec-websocket-extensions" not in stream.response.headers, "uvicorn_websocket.py is not installed"
+        stream.send(json.dumps({"observation": BOARD}))
+        assert "action" in json.loads(stream.recv(20))
 
 
 @pytest.mark.e2e

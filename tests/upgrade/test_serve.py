@@ -6,7 +6,6 @@ relies on it.
 
 import ast
 import inspect
-import json
 import re
 import subprocess
 import threading
@@ -14,10 +13,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from time import monotonic, sleep
 from types import SimpleNamespace
-from typing import Any
 
 import httpx
-import psutil
 import pytest
 import uvicorn
 from ray._private.function_manager import FunctionActorManager
@@ -25,7 +22,6 @@ from ray._private.worker import global_worker
 from ray._raylet import PythonFunctionDescriptor
 from ray.serve._private import common, grpc_util, http_util, replica
 from ray.serve._private.common import RequestProtocol
-from ray.serve._private.constants import SERVE_HTTP_REQUEST_ID_HEADER
 from ray.serve._private.haproxy import BackendConfig, HAProxyApi, HAProxyConfig, ServerConfig
 from ray.serve._private.replica import SERVE_BUILD_ASGI_APP_METHOD
 from ray.serve.config import HTTPOptions, gRPCOptions
@@ -35,13 +31,10 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from uvicorn.server import ServerState
 from websockets.protocol import State
 from websockets.server import ServerProtocol
-from websockets.sync.client import connect
 
 from serve_app.runtime import haproxy, haproxy_script, ray_serve, uvicorn_http, uvicorn_websocket
 from serve_app.runtime.ray_serve import AsgiReplica
 from serve_app.runtime.starting_page import starting_page
-from tests.support.clients.actions import BOARD
-from tests.support.servers.under_load import RayServer
 from tests.support.waiting import until
 
 STATS, METRICS, HTTP, GRPC = 8404, 9101, 8000, 8001
@@ -443,65 +436,6 @@ class TestRayServe:
         assert isinstance(DEFAULT_GRPC_SERVER_OPTIONS, list)
         methods = grpc_util.SERVE_DESCRIPTOR.services_by_name["RayServeAPIService"].methods
         assert not [field for method in methods for field in method.input_type.fields], "they are not read"
-
-
-def act(client: httpx.Client) -> httpx.Response:
-    return client.post("/v1/policies/board/action", json={"observation": BOARD})
-
-
-def _listening(process: psutil.Process) -> set[Any]:
-    """The addresses on which a process listens; none if it has ended."""
-    try:
-        found = process.net_connections("tcp")
-    except psutil.NoSuchProcess:
-        return set()
-    return {each.laddr for each in found if each.status == psutil.CONN_LISTEN}
-
-
-@pytest.mark.e2e
-class TestServer:
-    """A real server, with Ray Serve and HAProxy."""
-
-    @pytest.fixture
-    def url(self, ray_server: RayServer) -> str:
-        with httpx.Client(base_url=ray_server.url, trust_env=False) as client:
-            # Until HAProxy knows the replica, Ray Serve's proxy answers, without our protocols.
-            until(lambda: "x-request-id" not in act(client).headers, seconds=120)
-        return ray_server.url
-
-    def test_requests_bypass_ray_serve(self, url: str) -> None:
-        with httpx.Client(base_url=url, trust_env=False) as client:
-            assert client.get("/-/routes").json() == {"/": "policy-league"}, "Ray Serve answers its own paths"
-            assert SERVE_HTTP_REQUEST_ID_HEADER == "x-request-id", "Ray Serve marks the responses that it handles"
-            for method, path, body in (
-                ("POST", "/v1/policies/board/action", {"observation": BOARD}),
-                ("POST", "/v2/models/board/infer", {"inputs": []}),
-                ("GET", "/v1/leagues", None),
-                ("GET", "/v1/health/live", None),
-            ):
-                direct = client.request(method, path, json=body)
-                assert direct.headers["content-type"] == "application/json"
-                assert "x-request-id" not in direct.headers, f"{path} does not bypass Ray Serve: see serve_bypass.py"
-
-    def test_the_protocols_are_installed_in_replicas(self, url: str) -> None:
-        address = url.replace("http://", "ws://") + "/v1/policies/board/stream"
-        with connect(address, proxy=None) as stream:  # offers compression, which uvicorn's own protocol accepts
-            assert stream.response is not None
-            assert "sec-websocket-extensions" not in stream.response.headers, "uvicorn_websocket.py is not installed"
-            stream.send(json.dumps({"observation": BOARD}))
-            assert "action" in json.loads(stream.recv(20))
-
-    def test_haproxy_listens_on_loopback_only(self, url: str) -> None:
-        port = int(url.rpartition(":")[2])
-
-        def listening() -> set[Any]:
-            """The addresses of the processes that listen on the port of the server."""
-            addresses = [_listening(process) for process in psutil.Process().children(recursive=True)]
-            return set().union(*(found for found in addresses if any(address.port == port for address in found)))
-
-        # HTTP, gRPC, and HAProxy's statistics and metrics. While HAProxy reloads, they can be missing.
-        until(lambda: len(listening()) >= 4)
-        assert {address.ip for address in listening()} == {"127.0.0.1"}
 
 
 def test_statistics_of_a_replica_replace_those_of_serve() -> None:
