@@ -40,16 +40,16 @@ def test_libraries_of_the_system_and_of_other_environments_are_libraries(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str
 ) -> None:
     """A virtual environment can have several folders of libraries (`--system-site-packages`)."""
-    others = tmp_path / "usr" / "lib" / folder
-    metadata = others / "wood-1.2.dist-info" / "METADATA"
+    libraries = tmp_path / "usr" / "lib" / folder
+    metadata = libraries / "wood-1.2.dist-info" / "METADATA"
     metadata.parent.mkdir(parents=True)
     metadata.write_text("Metadata-Version: 2.1\nName: wood\nVersion: 1.2\n")
-    (others / "wood.py").write_text("import scipy\n")
-    monkeypatch.syspath_prepend(str(others))
+    (libraries / "wood.py").write_text("import scipy\n")
+    monkeypatch.syspath_prepend(str(libraries))
     (package / "rules.py").write_text("import wood\n")
     code = read()
     assert code.libraries == {"numpy": version("numpy"), "wood": "1.2"}
-    (others / "wood.py").write_text("WIN = 1\n")
+    (libraries / "wood.py").write_text("WIN = 1\n")
     assert read() == code
 
 

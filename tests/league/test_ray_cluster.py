@@ -43,18 +43,16 @@ assert not ray.is_initialized()
 def test_a_local_ray_has_limits_and_a_dashboard() -> None:
     process = subprocess.run([sys.executable, "-c", LOCAL], capture_output=True, text=True, timeout=DEADLINE)
     assert process.returncode == 0, process.stderr
-    found = json.loads(process.stdout)
-    assert found["resources"]["CPU"] == 1
-    assert found["resources"]["object_store_memory"] == 100 * 10**6
-    assert found["url"].startswith("http://127.0.0.1:")
-    assert found["status"] == 200
+    printed = json.loads(process.stdout)
+    assert printed["resources"]["CPU"] == 1
+    assert printed["resources"]["object_store_memory"] == 100 * 10**6
+    assert printed["url"].startswith("http://127.0.0.1:")
+    assert printed["status"] == 200
 
 
-def test_an_object_store_that_is_too_small_is_rejected(tmp_path: Path) -> None:
-    process = subprocess.run(
-        [sys.executable, "-c", LOCAL.replace("=100", "=50")], capture_output=True, text=True, timeout=DEADLINE
-    )
-    assert "ConfigError: --object-store: at least 80 MB, got 50" in process.stderr
+def test_an_object_store_that_is_too_small_is_rejected() -> None:
+    with pytest.raises(ConfigError, match="--object-store: at least 80 MB, got 50"):
+        LocalRay(object_store=50)
 
 
 def test_a_ray_that_does_not_start_is_reported_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,11 +83,11 @@ def test_a_local_ray_has_neither_an_autoscaler_nor_nodes_that_leave() -> None:
 @pytest.mark.usefixtures("ray_session")
 def test_several_machines_need_shared_storage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Dead nodes are not counted."""
-    here = ray.get_runtime_context().get_node_id()  # the only one that can answer
+    node = ray.get_runtime_context().get_node_id()  # the only one that can answer
 
     def connect(storage: Storage, is_second_alive: bool) -> None:
         nodes = [("192.0.2.1", True), ("192.0.2.2", is_second_alive)]
-        rows = [{"NodeManagerAddress": address, "NodeID": here, "Alive": alive} for address, alive in nodes]
+        rows = [{"NodeManagerAddress": address, "NodeID": node, "Alive": alive} for address, alive in nodes]
         monkeypatch.setattr(ray, "nodes", lambda: rows)
         with connected(None, storage):
             pass

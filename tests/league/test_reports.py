@@ -27,8 +27,8 @@ def test_the_first_import_asks_libraries_to_report_nothing() -> None:
         return dict(json.loads(output))
 
     assert variables() == REPORTS_OFF
-    chosen = {"RAY_USAGE_STATS_ENABLED": "1", "ORT_DISABLE_TELEMETRY": ""}
-    assert variables(**chosen) == REPORTS_OFF | chosen
+    choices = {"RAY_USAGE_STATS_ENABLED": "1", "ORT_DISABLE_TELEMETRY": ""}
+    assert variables(**choices) == REPORTS_OFF | choices
 
 
 @pytest.mark.slow

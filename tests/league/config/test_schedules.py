@@ -39,7 +39,7 @@ def test_an_annealed_value_moves_from_initial_to_final(
     kind: Any, initial: float, final: float, first: float, second: float
 ) -> None:
     schedule = AnnealingConfig(schedule=kind, initial=initial, final=final)
-    earlier, later = (schedule.at(at(budget=each)) for each in sorted([first, second]))
+    earlier, later = (schedule.at(at(budget=share)) for share in sorted([first, second]))
     low, high = min(initial, final), max(initial, final)
     assert schedule.at(at(budget=0.0)) == initial
     assert schedule.at(at(budget=1.0)) == final
@@ -58,11 +58,11 @@ def test_a_schedule_in_steps_does_not_depend_on_the_budget(
 
 @given(schedule=points(), step=STEPS)
 def test_a_piecewise_value_lies_between_its_neighbours(schedule: tuple[tuple[int, float], ...], step: int) -> None:
-    before = [value for each, value in schedule if each <= step][-1:]
-    after = [value for each, value in schedule if each > step][:1]
+    before = [value for at_step, value in schedule if at_step <= step][-1:]
+    after = [value for at_step, value in schedule if at_step > step][:1]
     neighbours = before + after
     assert min(neighbours) - 1e-12 <= scheduled_value(schedule, at(step)) <= max(neighbours) + 1e-12
-    assert [scheduled_value(schedule, at(each)) for each, _ in schedule] == [value for _, value in schedule]
+    assert [scheduled_value(schedule, at(at_step)) for at_step, _ in schedule] == [value for _, value in schedule]
 
 
 @given(initial=VALUES, final=VALUES, length=st.integers(1, 10**7), step=STEPS)

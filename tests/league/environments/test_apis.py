@@ -8,6 +8,7 @@ import pytest
 from gymnasium import spaces
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from ray.rllib.env.multi_agent_env import MultiAgentEnv
 
 from league.config.league import LeagueConfig
 from league.environments.apis import RLlibEnv, with_api
@@ -61,25 +62,6 @@ class Rounds(ParallelEnv):
 
     def render_for(self, agent: Any) -> Any:
         return np.full((2, 2, 3), self._ids.index(agent), np.uint8)
-
-
-class MultiAgentEnv:
-    """The parts of RLlib's class that matter here, since tests of the kernel do not import RLlib."""
-
-    observation_spaces = action_spaces = observation_space = action_space = None
-    agents: list = []  # noqa: RUF012
-    possible_agents: list = []  # noqa: RUF012
-
-    def get_observation_space(self, agent: Any) -> Any:
-        return self._space(self.observation_spaces, self.observation_space, agent)
-
-    def get_action_space(self, agent: Any) -> Any:
-        return self._space(self.action_spaces, self.action_space, agent)
-
-    def _space(self, by_agent: Any, common: Any, agent: Any) -> Any:
-        if by_agent is not None:
-            return by_agent[agent]
-        return common[agent] if isinstance(common, spaces.Dict) and agent in common.spaces else common
 
 
 class Group(MultiAgentEnv):
@@ -149,8 +131,8 @@ def league(entry_point: str, api: str | None = None, **kwargs: Any) -> LeagueCon
 def test_agents_from_an_unordered_set_are_sorted() -> None:
     """RLlib infers the list from a set, whose order differs between processes."""
     env = Group()
-    env._agent_ids = {"d", "a", "c", "b"}  # type: ignore[attr-defined]
-    env.possible_agents = list(env._agent_ids)  # type: ignore[attr-defined]
+    env._agent_ids = {"d", "a", "c", "b"}
+    env.possible_agents = list(env._agent_ids)
     assert RLlibEnv(env).possible_agents == ["a", "b", "c", "d"]
     env.possible_agents = ["b", "a"]
     assert RLlibEnv(env).possible_agents == ["b", "a"]

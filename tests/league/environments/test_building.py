@@ -1,6 +1,5 @@
 """Environments from configurations: their policies and sides, and what cannot be built."""
 
-import importlib
 from typing import Any
 
 import pytest
@@ -10,7 +9,6 @@ from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.building import Cycle, build, describe_policies, interface
 from league.errors import ConfigError, EnvironmentMismatch
-from tests.support.environments.wrapped import assert_same_episodes, with_supersuit
 
 COUNTING = "tests.support.environments.counting:counting"
 
@@ -21,10 +19,10 @@ def league(entry_point: str = COUNTING, **changes: Any) -> LeagueConfig:
 
 
 def test_by_default_each_agent_is_a_side_and_all_share_a_policy() -> None:
-    found = interface(LeagueConfig.load("policy_league/configs/connect_four.yaml"))
-    assert list(found.agents) == ["player_0", "player_1"]
-    assert found.policies == {"player_0": "shared", "player_1": "shared"}
-    assert found.sides == {"player_0": ("player_0",), "player_1": ("player_1",)}
+    described = interface(LeagueConfig.load("policy_league/configs/connect_four.yaml"))
+    assert list(described.agents) == ["player_0", "player_1"]
+    assert described.policies == {"player_0": "shared", "player_1": "shared"}
+    assert described.sides == {"player_0": ("player_0",), "player_1": ("player_1",)}
 
 
 def test_agents_are_matched_by_pattern_in_order() -> None:
@@ -168,25 +166,3 @@ def test_the_api_is_inferred_or_configured() -> None:
         (f"{RPS}:parallel_env", None, ParallelEnv),
     ):
         assert isinstance(build(EnvironmentConfig(entry_point=entry_point, api=api)), expected)
-
-
-PIXELS = [{"color_reduction_v0": {"mode": "B"}}, {"resize_v1": {"x_size": 42, "y_size": 42}}, "frame_stack_v1"]
-
-
-PISTONS = {"n_pistons": 4, "max_cycles": 20, "render_mode": "rgb_array"}
-
-
-@pytest.mark.parametrize(
-    ("entry_point", "kwargs", "wrappers"),
-    [
-        (SPREAD, {}, []),
-        ("mpe2.simple_adversary_v3", {"continuous_actions": True}, []),
-        ("mpe2.simple_world_comm_v3", {}, ["pad_observations_v0", "agent_indicator_v0"]),
-        ("pettingzoo.butterfly.pistonball_v6", PISTONS, PIXELS),
-    ],
-)
-def test_a_cycle_at_a_time_equals_pettingzoos_conversion(
-    entry_point: str, kwargs: dict[str, Any], wrappers: list[Any]
-) -> None:
-    ours = build(EnvironmentConfig(entry_point=entry_point, kwargs=kwargs, wrappers=wrappers))
-    assert_same_episodes(ours, with_supersuit(importlib.import_module(entry_point).parallel_env(**kwargs), wrappers))

@@ -43,7 +43,6 @@ def test_verified_environments_are_vectorised(monkeypatch: pytest.MonkeyPatch) -
 def test_other_environments_are_stepped_in_lockstep(subtests: pytest.Subtests) -> None:
     for config, reason in (
         ({"entry_point": PISTONBALL}, "has no vectorised implementation"),
-        ({"entry_point": SPREAD, "wrappers": ["black_death_v3"]}, "wrapper black_death_v3"),
         ({"entry_point": CONNECT_FOUR, "kwargs": {"render_mode": "rgb_array"}}, "arguments: .*render_mode"),
         ({"entry_point": SPREAD, "api": "aec"}, "aec is not the vectorised API"),
         (

@@ -18,7 +18,6 @@ from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, inputs
 from tests.conformance.stepping import assert_stepping_conforms
 from tests.support.environments import masked
 from tests.support.environments.masked import ACTIONS, AGENTS, APIS, BOX, ParallelMasked, RLlibMasked
-from tests.support.environments.simultaneous import Simultaneous
 
 
 def masked_league(api: str, space: str, **kwargs: Any) -> LeagueConfig:
@@ -69,40 +68,16 @@ class InfoMaskTicTacToe(tictactoe_v3.raw_env):
             self.observe(agent)
 
 
-class Countdown(Simultaneous):
-    """Two agents with two actions each; the second action is legal at odd times only. Masks are in infos."""
-
-    def __init__(self, width: int = 2, without: str | None = None) -> None:
-        super().__init__(leaves=(5, 5))
-        self._width, self._without = width, without
-
-    def action_space(self, agent: str) -> spaces.Space:
-        return spaces.Discrete(2)
-
-    def _masks(self) -> dict[str, Any]:
-        mask = np.array([1] + [self.time % 2] * (self._width - 1), np.int8)
-        return {agent: {"action_mask": mask} for agent in self.possible_agents if agent != self._without}
-
-    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
-        return super().reset(seed)[0], self._masks()
-
-    def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
-        is_illegal = self.time % 2 == 0 and any(action for agent, action in actions.items() if agent != self._without)
-        assert not is_illegal, "illegal action 1"
-        return *super().step(actions)[:-1], self._masks()
-
-
 def league(environment: type, **kwargs: Any) -> LeagueConfig:
     entry_point = f"{__name__}:{environment.__name__}"
     return LeagueConfig.from_mapping({"league": "masks", "environment": {"entry_point": entry_point, "kwargs": kwargs}})
 
 
-@pytest.mark.parametrize("environment", [InfoMaskTicTacToe, Countdown])
-def test_masks_are_part_of_the_observations(environment: type) -> None:
-    for spaces_of_agent in interface(league(environment)).agents.values():
+def test_masks_are_part_of_the_observations() -> None:
+    for spaces_of_agent in interface(league(InfoMaskTicTacToe)).agents.values():
         assert isinstance(spaces_of_agent.observation, DictSpace)
         assert set(spaces_of_agent.observation.spaces) == {OBSERVATION, ACTION_MASK}
-    examination = examine(league(environment), episodes=10)
+    examination = examine(league(InfoMaskTicTacToe), episodes=10)
     assert examination.passed, examination.findings
     plain = EnvironmentConfig(entry_point="pettingzoo.classic.rps_v2")
     assert not isinstance(
@@ -114,16 +89,6 @@ def test_episodes_equal_those_of_masks_in_observations() -> None:
     assert_stepping_conforms(
         lambda n: stock_stepping(league(InfoMaskTicTacToe).environment, n), tictactoe_v3.env, list(range(8)), num_envs=4
     )
-
-
-def test_masks_in_infos_may_be_missing_but_need_the_width_of_the_actions() -> None:
-    env = build(league(Countdown, without="agent_1").environment)
-    observations, _ = env.reset(seed=1)
-    assert observations["agent_1"][ACTION_MASK].tolist() == [1, 1], "without a mask all actions are legal"
-    observations, *_ = env.step({"agent_0": 0, "agent_1": 1})
-    assert observations["agent_0"][ACTION_MASK].tolist() == [1, 1]
-    with pytest.raises(EnvironmentMismatch, match=r"'agent_0' has an action_mask of shape \[3\], expected \[2\]"):
-        build(league(Countdown, width=3).environment).reset(seed=1)
 
 
 @pytest.mark.parametrize("api", APIS)
@@ -184,6 +149,20 @@ class ParallelInfoMasks(InfoMasks, ParallelMasked): ...
 
 
 class RLlibInfoMasks(InfoMasks, RLlibMasked): ...
+
+
+def test_masks_in_infos_may_change_or_be_missing_but_need_the_width_of_the_actions() -> None:
+    env = build(league(ParallelInfoMasks).environment)
+    masks = env.unwrapped.masks
+    del masks["bob"]
+    observations, _ = env.reset(seed=1)
+    assert observations["bob"][ACTION_MASK].tolist() == [1, 1, 1], "without a mask all actions are legal"
+    masks["ann"] = {"action_mask": np.array([1, 0, 0])}
+    observations, *_ = env.step(dict.fromkeys(AGENTS, np.int64(0)))
+    assert observations["ann"][ACTION_MASK].tolist() == [1, 0, 0]
+    masks["ann"] = {"action_mask": np.ones(4)}
+    with pytest.raises(EnvironmentMismatch, match=r"'ann' has an action_mask of shape \[4\], expected \[3\]"):
+        env.reset(seed=1)
 
 
 @pytest.mark.parametrize("environment", [ParallelInfoMasks, RLlibInfoMasks])

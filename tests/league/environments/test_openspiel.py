@@ -30,9 +30,9 @@ def test_the_returns_are_those_of_the_game() -> None:
 
 
 def test_parameters_and_information_states() -> None:
-    found = interface(league("kuhn_poker", players=3, information_state=True))
-    assert len(found.agents) == 3
-    assert found.hidden_information
+    described = interface(league("kuhn_poker", players=3, information_state=True))
+    assert len(described.agents) == 3
+    assert described.hidden_information
     current, information = (env("kuhn_poker", information_state=value) for value in (False, True))
     shapes = [game.observation_space("player_0")["observation"].shape for game in (current, information)]
     assert shapes == [(7,), (11,)]
@@ -40,13 +40,13 @@ def test_parameters_and_information_states() -> None:
 
 
 def test_simultaneous_moves_are_hidden_until_both_have_moved() -> None:
-    seen = []
+    views = []
     for first in (0, 1):
         game = env("matrix_rps")
         game.reset(seed=0)
         game.step(first)
-        seen.append(game.observe("player_1")["observation"])
-    assert np.array_equal(*seen)
+        views.append(game.observe("player_1")["observation"])
+    assert np.array_equal(*views)
     assert interface(league("matrix_rps")).hidden_information
 
 

@@ -18,8 +18,8 @@ THREE = Discrete(n=3)
 
 
 def spaces(action: Any = THREE, shape: tuple[int, ...] = (4,), low: Any = -1, high: Any = 1) -> AgentInterface:
-    seen = Box(dtype="float32", shape=shape, low=low, high=high)
-    return AgentInterface(observation=DictSpace(spaces={"observation": seen}), action=action)
+    observation = Box(dtype="float32", shape=shape, low=low, high=high)
+    return AgentInterface(observation=DictSpace(spaces={"observation": observation}), action=action)
 
 
 def interface(*kinds: AgentInterface, hidden: bool = False) -> Interface:
@@ -76,7 +76,7 @@ def test_values_survive_yaml(tmp_path: Path) -> None:
 
 def test_the_algorithm_fits_the_actions() -> None:
     box = Box(dtype="float32", shape=(2,), low=-1, high=1)
-    for api, action, others in (
+    for api, action, remark in (
         ("AEC", Discrete(n=3), "also possible: dqn"),
         ("Parallel", Discrete(n=3), "also possible: dqn, qmix (a team), maddpg"),
         ("Parallel", box, "also possible: maddpg"),
@@ -84,7 +84,7 @@ def test_the_algorithm_fits_the_actions() -> None:
         ("Parallel", MultiDiscrete(nvec=[2, 3], start=[0, 0], shape=(2,)), "the only one for these spaces"),
     ):
         lines = list(map(str, _training(examined(api), interface(spaces(action), spaces(action)), is_team=False)))
-        assert next(line for line in lines if "algorithm: ppo" in line).endswith(others)
+        assert next(line for line in lines if "algorithm: ppo" in line).endswith(remark)
 
 
 def test_episodes_and_hidden_information_decide_discount_and_annealing() -> None:
@@ -100,10 +100,10 @@ def test_episodes_and_hidden_information_decide_discount_and_annealing() -> None
 
 
 def test_measured_openings_are_used_unless_actions_are_sampled() -> None:
-    known = parsed(_play(config(), examined(), interface(spaces(), spaces()), is_team=False))["play"]
+    open_play = parsed(_play(config(), examined(), interface(spaces(), spaces()), is_team=False))["play"]
     hidden = parsed(_play(config(), examined(), interface(spaces(), spaces(), hidden=True), is_team=False))["play"]
     team = parsed(_play(config(), examined(), interface(spaces(), spaces(), hidden=True), is_team=True))["play"]
-    assert known == {"actions": "greedy", "opening_plies": 3}
+    assert open_play == {"actions": "greedy", "opening_plies": 3}
     assert hidden == {"actions": "sampled", "opening_plies": 0}
     assert team == {"actions": "greedy", "opening_plies": 3}
 

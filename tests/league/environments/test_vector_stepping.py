@@ -82,40 +82,40 @@ class Player:
         return (self.rng.random(mask.shape) * mask).argmax(axis=1)
 
 
-def assert_same_rows(found: AgentRows | Batch, expected: AgentRows | Batch) -> None:
+def assert_same_rows(vector: AgentRows | Batch, expected: AgentRows | Batch) -> None:
     for field in fields(expected):
-        mine, other = getattr(found, field.name), getattr(expected, field.name)
-        columns = ((mine[name], other[name]) for name in other) if isinstance(other, dict) else [(mine, other)]
-        for own, column in columns:
-            assert own.dtype == column.dtype, field.name
-            assert own.tobytes() == column.tobytes(), field.name
-            assert own.shape == column.shape
+        actual, other = getattr(vector, field.name), getattr(expected, field.name)
+        columns = ((actual[name], other[name]) for name in other) if isinstance(other, dict) else [(actual, other)]
+        for ours, column in columns:
+            assert ours.dtype == column.dtype, field.name
+            assert ours.tobytes() == column.tobytes(), field.name
+            assert ours.shape == column.shape
 
 
-def assert_same_turn(found: Turn, expected: Turn) -> None:
-    assert list(found.batches) == list(expected.batches)
+def assert_same_turn(vector: Turn, expected: Turn) -> None:
+    assert list(vector.batches) == list(expected.batches)
     for group, batch in expected.batches.items():
-        assert_same_rows(found.batches[group], batch)
-    assert len(found.endings) == len(expected.endings)
-    for mine, other in zip(found.endings, expected.endings, strict=True):
-        assert_same_rows(mine, other)
-    np.testing.assert_array_equal(found.finished, expected.finished)
-    np.testing.assert_array_equal(found.crashed, expected.crashed)
-    np.testing.assert_equal(states_of(found.states), states_of(expected.states))
-    np.testing.assert_equal(states_of(found.last_states), states_of(expected.last_states))
+        assert_same_rows(vector.batches[group], batch)
+    assert len(vector.endings) == len(expected.endings)
+    for actual, other in zip(vector.endings, expected.endings, strict=True):
+        assert_same_rows(actual, other)
+    np.testing.assert_array_equal(vector.finished, expected.finished)
+    np.testing.assert_array_equal(vector.crashed, expected.crashed)
+    np.testing.assert_equal(states_of(vector.states), states_of(expected.states))
+    np.testing.assert_equal(states_of(vector.last_states), states_of(expected.last_states))
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 2**32), num_envs=st.integers(1, 6))
 def test_turns_equal_those_of_lockstep(name: str, seed: int, num_envs: int) -> None:
     config = ENVIRONMENTS[name]
     assert implementation(config).vector is not None
-    found = Player(stepping(config, num_envs, crashes=3, states=True), seed)
+    vector = Player(stepping(config, num_envs, crashes=3, states=True), seed)
     expected = Player(stock_stepping(config, num_envs, crashes=3, states=True), seed)
-    assert_same_turn(found.start(), expected.start())
+    assert_same_turn(vector.start(), expected.start())
     for _ in range(30):
-        assert_same_turn(found.step(), expected.step())
+        assert_same_turn(vector.step(), expected.step())
         if not expected.turn.batches:
             break
 

@@ -59,12 +59,14 @@ assert ray.util.get_node_ip_address() == "127.0.0.1"
 address = ray.get_runtime_context().gcs_address
 import subprocess
 script = "import ray; from league.ray_cluster import join; join(sys.argv[1]); print(*ray.cluster_resources())"
-joined = subprocess.run([sys.executable, "-c", "import sys; " + script, address], capture_output=True, text=True)
-assert "CPU" in joined.stdout, joined.stderr
-strangers = {name: value for name, value in os.environ.items() if name != token.TOKEN}
 command = [sys.executable, "-c", "import sys; " + script, address]
-refused = subprocess.run(command, env=strangers, capture_output=True, text=True)
-assert "ConfigError: no Ray cluster" in refused.stderr and "CPU" not in refused.stdout, refused
+strangers = {name: value for name, value in os.environ.items() if name != token.TOKEN}
+pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+joining, refused = (subprocess.Popen(command, env=env, **pipes) for env in (os.environ, strangers))
+output, errors = joining.communicate()
+assert "CPU" in output, errors
+output, errors = refused.communicate()
+assert "ConfigError: no Ray cluster" in errors and "CPU" not in output, (output, errors)
 """
 PROCESSES = """
 start_local(LocalRay(cpus=1))

@@ -142,9 +142,6 @@ def moved(tmp_path: Path) -> Registry:
 
 def test_versions_of_another_environment_are_not_selected(moved: Registry) -> None:
     assert [version.ref for version in eligible(moved, tictactoe.LEAGUE)] == ["tictactoe@2", "tictactoe@3"]
-    report = evaluate(tictactoe.LEAGUE, registry=moved, blocks=2)
-    refs = {standing.ref for standing in report.leaderboard}
-    assert refs == {"tictactoe@2", "tictactoe@3", "script:random", "script:one_ply"}
     with pytest.raises(UnknownLeague):
         eligible(moved, "chess")
 

@@ -1,7 +1,6 @@
 """Greedy and sampled actions of a graph, and the errors for invalid inputs."""
 
 from pathlib import Path
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from league.errors import ArtifactCorrupt, EnvironmentMismatch, InvalidInput, ObservationError
+from league.interface import AgentInterface
+from league.policies.actions import to_environment
+from league.policies.draws import sample
 from league.policies.onnx import OnnxPolicy
-from league.registry.storage.manifest import Parity, PolicyManifest, Tensor
-from league.spaces import Box, DictSpace, Discrete
+from league.registry.storage.manifest import PolicyManifest, Tensor
+from league.spaces import Box, Discrete
+from tests.support.leagues.manifests import policy_manifest
+from tests.support.leagues.served_leagues import BOARD
 from tests.support.policies.graphs import continuous, counting, masked_mlp
 
 GRAPH = masked_mlp()
@@ -25,23 +29,7 @@ POLICY = OnnxPolicy(GRAPH)
 
 def manifest(**changes: Any) -> PolicyManifest:
     """The manifest of `masked_mlp`."""
-    board = Box(dtype="int8", shape=(6, 7, 2), low=0, high=1)
-    mask = Box(dtype="int8", shape=(7,), low=0, high=1)
-    fields: dict[str, Any] = {
-        "file": "shared.onnx",
-        "observation": DictSpace(spaces={"observation": board, "action_mask": mask}),
-        "action": Discrete(n=7),
-        "inputs": (
-            Tensor(name="observation", dtype="int8", shape=(None, 6, 7, 2)),
-            Tensor(name="action_mask", dtype="int8", shape=(None, 7)),
-        ),
-        "outputs": (
-            Tensor(name="action", dtype="int64", shape=(None,)),
-            Tensor(name="action_dist_inputs", dtype="float32", shape=(None, 7)),
-        ),
-        "parity": Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
-    }
-    return PolicyManifest.model_validate(fields | changes)
+    return policy_manifest(BOARD, "shared", GRAPH).model_copy(update=changes)
 
 
 def observations(rows: int, seed: int = 0) -> dict[str, np.ndarray]:
@@ -71,18 +59,6 @@ def test_actions_do_not_depend_on_the_batch() -> None:
     for row in range(20):
         alone = {name: array[row : row + 1] for name, array in batch.items()}
         assert POLICY.act(alone, explore=True, rng=generators(20)[row : row + 1]).actions == together[row]
-
-
-def test_exploring_follows_the_distribution() -> None:
-    rows = 20_000
-    batch = {name: np.repeat(array, rows, axis=0) for name, array in observations(1, seed=3).items()}
-    answer = POLICY.act(batch, explore=True, rng=generators(rows))
-    assert answer.dist_inputs is not None
-    weights = np.exp(answer.dist_inputs[0].astype(np.float64))
-    probability = weights / weights.sum()
-    share = np.bincount(answer.actions, minlength=7) / rows
-    assert (probability > 0.05).sum() > 2, "several actions are likely"
-    assert (np.abs(share - probability) <= 5 * np.sqrt(probability * (1 - probability) / rows)).all()
 
 
 @given(arrays(np.int8, (4, 7), elements=st.integers(0, 1)), st.integers(0, 2**32))
@@ -125,33 +101,22 @@ def test_recurrent_state_is_passed_in_and_returned() -> None:
     assert explored.dist_inputs is not None
 
 
-def test_sampled_vectors_are_within_their_bounds() -> None:
-    """Means and log standard deviations are both the observation, here 0.2 and -0.5."""
-    rows = 4000
+def test_exploring_samples_from_the_distribution() -> None:
+    """That of the vectors has the observation as means and as log standard deviations."""
+    rows, board = 50, observations(50)
     space = Box(dtype="float32", shape=(2,), low=[-1.0, 0.0], high=[1.0, 10.0])
-    policy = OnnxPolicy(
-        continuous(),
-        manifest(
-            observation=Box(dtype="float32", shape=(2,), low=None, high=None),
-            action=space,
-            inputs=(Tensor(name="observation", dtype="float32", shape=(None, 2)),),
-            outputs=(
-                Tensor(name="action", dtype="float32", shape=(None, 2)),
-                Tensor(name="action_dist_inputs", dtype="float32", shape=(None, 4)),
-            ),
-        ),
-    )
-    batch = {"observation": np.tile(np.array([0.2, -0.5], np.float32), (rows, 1))}
-    answer = policy.act(batch, explore=True, rng=generators(rows))
-    assert (answer.actions >= [-1, 0]).all()
-    assert (answer.actions <= [1, 10]).all()
+    unbounded = Box(dtype="float32", shape=(2,), low=None, high=None)
+    vector = AgentInterface(observation=unbounded, action=space)
+    policy = OnnxPolicy(continuous(), policy_manifest(vector, "shared", continuous()))
+    vectors = {"observation": np.tile(np.array([0.2, -0.5], np.float32), (rows, 1))}
+    for explored, batch, action in ((POLICY, board, Discrete(n=7)), (policy, vectors, space)):
+        answer = explored.act(batch, explore=True, rng=generators(rows))
+        assert answer.dist_inputs is not None
+        drawn = to_environment(sample(answer.dist_inputs, action, generators(rows)), action)
+        np.testing.assert_array_equal(answer.actions, drawn)
+        assert len(np.unique(answer.actions, axis=0)) > 3
     assert answer.dist_inputs is not None
     assert answer.dist_inputs[0].tolist() == pytest.approx([0.2, -0.5, 0.2, -0.5])
-    # A normal variable with mean μ and standard deviation σ is clipped at 1 with probability 1 − Φ((1 − μ) / σ).
-    cut = [1 - NormalDist(mean, np.exp(mean)).cdf(1) for mean in (0.2, -0.5)]
-    np.testing.assert_allclose((answer.actions == [1, 10]).mean(0), cut, atol=0.04)
-    alone = policy.act({"observation": batch["observation"][7:8]}, explore=True, rng=generators(8)[7:])
-    assert (alone.actions[0] == answer.actions[7]).all()
 
 
 def test_vectors_may_be_passed_alone_and_explore_only_with_a_manifest() -> None:
@@ -164,29 +129,20 @@ def test_vectors_may_be_passed_alone_and_explore_only_with_a_manifest() -> None:
 
 def test_an_observation_that_does_not_fit_is_rejected(subtests: pytest.Subtests) -> None:
     batch, recurrent = observations(1), {"observation": np.zeros((1, 1), np.float32)}
-    for act, message in (
-        (lambda: POLICY.act(batch["observation"]), r"action_mask is missing: expected a batch of int8 \[7\]"),
-        (
-            lambda: POLICY.act(batch | {"observation": np.zeros((1, 6, 7, 2))}),
-            r"observation is float64 \[6, 7, 2\]: expected .* int8",
-        ),
-        (
-            lambda: POLICY.act(batch | {"observation": np.zeros((1, 6, 7), np.int8)}),
-            r"observation is int8 \[6, 7\]: expected .*\[6, 7, 2\]",
-        ),
-        (
-            lambda: POLICY.act(batch | {"observation": np.zeros((2, 6, 7, 2), np.int8)}),
-            r"rows differ: .*'observation': 2",
-        ),
-        (lambda: POLICY.act(batch | {"observation": [[0]]}), r"observation is not a NumPy array"),
-        (
-            lambda: OnnxPolicy(counting()).act(recurrent, state={"state_in_0": np.zeros((1, 2), np.float32)}),
-            r"state_in_0 is float32 \[2\]",
-        ),
-        (lambda: OnnxPolicy(counting()).act(recurrent, state={}), r"state_in_0 is missing"),
-    ):
+    misfits: list[tuple[Any, str]] = [
+        (np.zeros((1, 6, 7, 2)), r"observation is float64 \[6, 7, 2\]: expected .* int8"),
+        (np.zeros((1, 6, 7), np.int8), r"observation is int8 \[6, 7\]: expected .*\[6, 7, 2\]"),
+        (np.zeros((2, 6, 7, 2), np.int8), "rows differ: .*'observation': 2"),
+        ([[0]], "observation is not a NumPy array"),
+    ]
+    for observation, message in misfits:
         with subtests.test(message=message), pytest.raises(ObservationError, match=message):
-            act()
+            POLICY.act(batch | {"observation": observation})
+    with pytest.raises(ObservationError, match=r"action_mask is missing: expected a batch of int8 \[7\]"):
+        POLICY.act(batch["observation"])
+    for state, message in (({"state_in_0": np.zeros((1, 2), np.float32)}, r"float32 \[2\]"), ({}, "missing")):
+        with pytest.raises(ObservationError, match=f"state_in_0 is {message}"):
+            OnnxPolicy(counting()).act(recurrent, state=state)
     for rng in (None, generators(1)):
         with pytest.raises(InvalidInput, match="2 rows needs rng"):
             POLICY.act(observations(2), explore=True, rng=rng)

@@ -29,25 +29,27 @@ def model(inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> dict[s
 
 
 def test_tensors_are_matched_by_datatype_and_shape() -> None:
-    found = read_signature(
+    signature = read_signature(
         "m", model([tensor("x", "FP32", 3), tensor("legal", "INT8", 4)], [tensor("policy_head", "FP32", 4)]), SPACES
     )
-    assert found.inputs == {"x": "observation", "legal": "action_mask"}
-    assert (found.output, found.is_logits) == ("policy_head", True)
+    assert signature.inputs == {"x": "observation", "legal": "action_mask"}
+    assert (signature.output, signature.is_logits) == ("policy_head", True)
 
 
 def test_a_finished_action_is_preferred_and_the_mask_is_optional() -> None:
-    found = read_signature(
+    signature = read_signature(
         "m", model([tensor("x", "FP32", 3)], [tensor("logits", "FP32", 4), tensor("best", "INT32")]), SPACES
     )
-    assert (found.output, found.is_logits, found.requested) == ("best", False, ["best"])
+    assert (signature.output, signature.is_logits, signature.requested) == ("best", False, ["best"])
 
 
 def test_state_is_matched_by_name() -> None:
     inputs = [tensor("x", "FP32", 3), tensor("state_in_0", "FP32", 8)]
-    found = read_signature("m", model(inputs, [tensor("action", "INT64"), tensor("state_out_0", "FP32", 8)]), SPACES)
-    assert found.state["state_in_0"].shape == (8,)
-    assert found.requested == ["action", "state_out_0"]
+    signature = read_signature(
+        "m", model(inputs, [tensor("action", "INT64"), tensor("state_out_0", "FP32", 8)]), SPACES
+    )
+    assert signature.state["state_in_0"].shape == (8,)
+    assert signature.requested == ["action", "state_out_0"]
 
 
 def test_models_that_do_not_fit_are_refused() -> None:

@@ -28,7 +28,7 @@ def generators(rows: int, seed: int = 0) -> list[np.random.Generator]:
 
 def winning_moves(game: str, moves: Sequence[int], own: bool) -> list[int]:
     """The actions with which the player to move wins immediately, or the opponent would if it were to move."""
-    found = []
+    winning = []
     for action in legal(environment_after(game, moves)):
         env = environment_after(game, moves)
         if not own:
@@ -36,8 +36,8 @@ def winning_moves(game: str, moves: Sequence[int], own: bool) -> list[int]:
         player = env.agent_selection
         env.step(action)
         if env.rewards[player] == 1:
-            found.append(action)
-    return found
+            winning.append(action)
+    return winning
 
 
 def chosen_actions(policy: Policy, env: Any) -> set[int]:
@@ -45,7 +45,7 @@ def chosen_actions(policy: Policy, env: Any) -> set[int]:
     return set(policy.act(observations([env] * DRAWS), rng=generators(DRAWS)).actions.tolist())
 
 
-@examples(120)
+@examples(75)
 @given(st.sampled_from(sorted(GAMES)), st.integers(0, 10_000), st.integers(0, 41))
 def test_one_ply_wins_or_blocks_or_plays_any_legal_move(game: str, seed: int, plies: int) -> None:
     moves = random_moves(game, seed, plies)
@@ -76,16 +76,6 @@ def masked(actions: int, start: int = 0) -> tuple[Space, Space]:
     board = Box(dtype="int8", shape=(2,), low=0, high=1)
     mask = Box(dtype="int8", shape=(actions,), low=0, high=1)
     return DictSpace(spaces={"observation": board, "action_mask": mask}), Discrete(n=actions, start=start)
-
-
-def test_random_is_uniform_over_legal_actions() -> None:
-    rows = 20_000
-    policy = script("random", *masked(5, start=10))
-    mask = np.tile(np.array([0, 1, 1, 0, 1], np.int8), (rows, 1))
-    batch = {"observation": np.zeros((rows, 2), np.int8), "action_mask": mask}
-    counts = np.bincount(policy.act(batch, rng=generators(rows)).actions, minlength=15)
-    assert counts[[11, 12, 14]].sum() == rows
-    assert (np.abs(counts[[11, 12, 14]] - rows / 3) < 5 * np.sqrt(rows * 2 / 9)).all()
 
 
 PAIR = MultiDiscrete(nvec=[2, 3], start=[0, 5], shape=(2,))
@@ -137,7 +127,7 @@ def test_unknown_scripts_and_unsupported_spaces_are_rejected(subtests: pytest.Su
 
 
 def test_random_applies_the_mask_of_each_element() -> None:
-    rows = 9_000
+    rows = 900
     policy = script("random", masked(5)[0], PAIR)
     mask = np.tile(np.array([0, 1, 1, 0, 1], np.int8), (rows, 1))
     actions = policy.act({"observation": mask, "action_mask": mask}, rng=generators(rows)).actions
@@ -158,8 +148,8 @@ def test_mirror_repeats_the_last_move_of_the_opponent() -> None:
     moves, answers = [2, 1, 1, 0, 2], []
     for move in moves:
         env.step(move)
-        seen = np.array([env.observe(agent)])
-        answers.append(int(policy.act({"observation": seen}).actions[0]))
+        observation = np.array([env.observe(agent)])
+        answers.append(int(policy.act({"observation": observation}).actions[0]))
         env.step(answers[-1])
     assert answers == [0, *moves[:-1]]
 
@@ -187,10 +177,11 @@ def test_random_without_a_mask_covers_the_space(subtests: pytest.Subtests) -> No
     ):
         with subtests.test(action=str(action)):
             policy = script("random", Box(dtype="float32", shape=(1,), low=0, high=1), action)
-            actions = policy.act({"observation": np.zeros((5000, 1), np.float32)}, rng=generators(5000)).actions
-            assert (actions.shape, actions.dtype) == ((5000, *action.shape), np.dtype(action.dtype))
-            tolerance = 0.01 if action.dtype == "float32" else 0
+            actions = policy.act({"observation": np.zeros((1000, 1), np.float32)}, rng=generators(1000)).actions
+            assert (actions.shape, actions.dtype) == ((1000, *action.shape), np.dtype(action.dtype))
+            tolerance = 0.03 if action.dtype == "float32" else 0
             np.testing.assert_allclose(actions.min(axis=0), low, atol=tolerance)
             np.testing.assert_allclose(actions.max(axis=0), high, atol=tolerance)
-            assert all(to_gymnasium(action).contains(row) for row in actions)
+            sampled = to_gymnasium(action)
+            assert all(sampled.contains(row) for row in actions)
             np.testing.assert_allclose(actions.mean(axis=0), np.add(low, high) / 2, atol=0.25)

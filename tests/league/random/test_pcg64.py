@@ -1,3 +1,5 @@
+"""PCG64 has the outputs of NumPy, SplitMix64 those of its reference implementation."""
+
 from collections.abc import Callable
 from typing import Any
 
@@ -5,10 +7,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from league.random import pcg64
+from league.random import pcg64, splitmix64
 from league.random.pcg64 import generate_state
+from league.random.seeds import derive, derive_each, generator, generators
 
-SEEDS = np.concatenate([np.arange(1000), np.random.default_rng(0).integers(2**31, size=2000), [2**31 - 1, 2**32 - 1]])
+SEEDS = np.concatenate([np.arange(200), np.random.default_rng(0).integers(2**31, size=600), [2**31 - 1, 2**32 - 1]])
 
 
 def with_numpy(draw: Callable[[np.random.Generator], Any]) -> np.ndarray:
@@ -16,18 +19,13 @@ def with_numpy(draw: Callable[[np.random.Generator], Any]) -> np.ndarray:
     return np.stack([draw(np.random.default_rng(int(seed))) for seed in SEEDS], axis=-1)
 
 
-def test_outputs_equal_those_of_numpy() -> None:
-    expected = with_numpy(lambda rng: rng.bit_generator.random_raw(20))
-    np.testing.assert_array_equal(pcg64.outputs(SEEDS, 20), expected)
-
-
 @given(st.lists(st.integers(0, 2**32 - 1), max_size=9), st.integers(1, 9))
 def test_outputs_of_a_seed_do_not_depend_on_the_others(seeds: list[int], count: int) -> None:
     expected = [np.random.PCG64(seed).random_raw(count) for seed in seeds]
-    found = pcg64.outputs(np.array(seeds, dtype=np.int64), count)
-    assert found.dtype == np.uint64
-    assert found.shape == (count, len(seeds))
-    assert found.T.tolist() == [array.tolist() for array in expected]
+    outputs = pcg64.outputs(np.array(seeds, dtype=np.int64), count)
+    assert outputs.dtype == np.uint64
+    assert outputs.shape == (count, len(seeds))
+    assert outputs.T.tolist() == [array.tolist() for array in expected]
 
 
 words = st.integers(0, 2**32 - 1)
@@ -65,3 +63,64 @@ def test_integers_that_numpy_draws_again_are_not_accepted() -> None:
     drawn, accepted = pcg64.integers(np.array([0, 1, 2**32 - 1], dtype=np.uint64), 3)
     assert accepted.tolist() == [False, True, True]
     assert drawn.tolist() == [0, 0, 2]
+
+
+seeds = st.integers(0, 2**63 - 1)
+
+
+paths = st.lists(st.integers(0, 2**31) | st.text(max_size=8), min_size=1, max_size=4)
+
+
+@given(seeds, paths)
+def test_a_seed_and_a_path_determine_a_seed(seed: int, path: list[int | str]) -> None:
+    assert derive(seed, *path) == derive(seed, *path)
+    assert 0 <= derive(seed, *path) < 2**63
+
+
+def test_adjacent_seeds_and_paths_differ() -> None:
+    children = {derive(seed, position) for seed in range(30) for position in range(30)}
+    assert len(children) == 900
+    assert generator(1, 2).integers(2**60) != generator(2, 1).integers(2**60)
+
+
+def test_known_values_are_stable_for_old_ledgers() -> None:
+    assert derive(0, 0) == 4334430513956379144
+    assert derive(42, "game", 3) == 1465044601826300333
+
+
+@given(seeds, st.lists(st.integers(0, 2**32 - 1), max_size=5))
+def test_many_seeds_are_derived_at_once(seed: int, numbers: list[int]) -> None:
+    assert derive_each(seed, numbers).tolist() == [derive(seed, number) for number in numbers]
+
+
+@given(st.lists(st.tuples(seeds, st.integers(0, 2**31)), max_size=4), st.text(max_size=8))
+def test_many_generators_are_created_at_once(rows: list[tuple[int, int]], name: str) -> None:
+    row_seeds, numbers = np.array(rows, dtype=np.int64).reshape(-1, 2).T
+    expected = [generator(seed, name, number, 3).bit_generator.state for seed, number in rows]
+    assert [rng.bit_generator.state for rng in generators(row_seeds, name, numbers, 3)] == expected
+
+
+SEED = 1234567
+
+
+EXPECTED = [6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431, 16408922859458223821]
+"""Of Vigna's splitmix64.c."""
+
+
+def test_outputs_are_those_of_the_reference() -> None:
+    seeds = np.array([[SEED], [0]], np.uint64)
+    outputs = splitmix64.outputs(seeds, np.arange(5))
+    assert outputs[0].tolist() == EXPECTED
+    assert outputs[1, 0] == 0xE220A8397B1DCDAF
+
+
+def test_integers_are_outputs_modulo_their_number() -> None:
+    numbers = np.arange(2000)
+    expected = [output % 240 for output in splitmix64.outputs(np.zeros(1, np.uint64), numbers).tolist()]
+    assert splitmix64.integers(numbers, 240).tolist() == expected
+    assert set(expected) == set(range(240))
+
+
+def test_outputs_do_not_depend_on_the_others() -> None:
+    numbers = np.array([4, 0, 2])
+    assert splitmix64.outputs(np.full(3, SEED, np.uint64), numbers).tolist() == [EXPECTED[i] for i in (4, 0, 2)]

@@ -16,7 +16,7 @@ from tests.support.leagues.registries import LEAGUE, leftovers, publish, registe
 pytestmark = on_both_databases
 
 
-PROCESSES = 3
+PROCESSES = 2
 
 
 @pytest.fixture(scope="module")

@@ -1,34 +1,22 @@
 """Evaluations in the registry: each is claimed by one runner, continues if that runner dies, and ends once."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 
 import pytest
-from sqlalchemy import update
 
-from league.errors import KeyReused, TooManyEvaluations, UnknownEvaluation, UnknownLeague
-from league.registry.evaluations import HEARTBEAT_TIMEOUT, MAX_ATTEMPTS
+from league.errors import TooManyEvaluations, UnknownEvaluation
+from league.registry.evaluations import MAX_ATTEMPTS
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY
-from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import EvaluationRow
 from tests.support.databases import on_both_databases
-from tests.support.leagues.registries import LEAGUE
+from tests.support.leagues.registries import LEAGUE, expire_heartbeats
 
 REQUEST = {"kind": "tournament", "blocks": 4}
 
 
 def submit(registry: Registry, max_active: int = 8) -> EvaluationRow:
     return registry.evaluations.submit(LEAGUE, REQUEST, actor="bot", reason="test", max_active=max_active)
-
-
-def expire_heartbeats(registry: Registry) -> None:
-    """Let all heartbeats expire."""
-    with registry.database.write() as session:
-        session.execute(
-            update(EvaluationRow).values(heartbeat_at=datetime.now(UTC) - HEARTBEAT_TIMEOUT - timedelta(seconds=1))
-        )
 
 
 def test_an_evaluation_is_submitted_claimed_and_completed(registry: Registry) -> None:
@@ -44,6 +32,8 @@ def test_an_evaluation_is_submitted_claimed_and_completed(registry: Registry) ->
     assert (claimed.id, claimed.state, claimed.runner, claimed.workers) == (submitted.id, "running", "a", 2)
     assert registry.evaluations.claim("b", workers=2) is None
     assert registry.evaluations.counts() == {LEAGUE: {"running": 1}}
+    with pytest.raises(UnknownEvaluation, match="has no evaluation 7"):
+        registry.evaluations.get(LEAGUE, 7)
     progress = {"what": "3 contestants", "played": 1, "of": 12}
     assert registry.evaluations.heartbeat(submitted.id, "a", progress).progress == progress
     registry.evaluations.finish(submitted.id, "a", "done", result={"games": 24})
@@ -70,13 +60,13 @@ def test_the_oldest_is_claimed_first_and_by_one_runner(registry: Registry) -> No
     numbers = [submit(registry).id for _ in range(3)]
     with ThreadPoolExecutor(6) as pool:
         claimed = list(pool.map(lambda name: registry.evaluations.claim(str(name), 1), range(6)))
-    assert sorted(each.id for each in claimed if each is not None) == numbers
+    assert sorted(row.id for row in claimed if row is not None) == numbers
 
 
 def test_an_evaluation_of_a_silent_runner_moves_to_another(registry: Registry) -> None:
     number = submit(registry).id
     registry.evaluations.claim("a", 1)
-    expire_heartbeats(registry)
+    expire_heartbeats(registry, EvaluationRow)
     reclaimed = registry.evaluations.claim("b", 1)
     assert reclaimed is not None
     assert (reclaimed.id, reclaimed.runner) == (number, "b")
@@ -92,7 +82,7 @@ def test_repeated_crashes_without_progress_fail_an_evaluation(registry: Registry
     for attempt in range(MAX_ATTEMPTS):
         assert registry.evaluations.claim(f"a{attempt}", 1) is not None
         registry.evaluations.heartbeat(number, f"a{attempt}", {"played": 1})
-        expire_heartbeats(registry)
+        expire_heartbeats(registry, EvaluationRow)
     assert registry.evaluations.claim("last", 1) is not None, "the first attempt made progress"
     registry.evaluations.release(number, "last")
     row = registry.evaluations.get(LEAGUE, number)
@@ -111,7 +101,7 @@ def test_a_stopped_evaluation_is_not_restarted(registry: Registry) -> None:
     assert (requested.state, requested.stopped_by) == ("running", "ada")
     assert registry.evaluations.stop(LEAGUE, running, actor="bob") == requested, "a second stop has no effect"
     assert registry.evaluations.heartbeat(running, "a").stop_at is not None
-    expire_heartbeats(registry)
+    expire_heartbeats(registry, EvaluationRow)
     assert registry.evaluations.claim("b", 1) is None
     assert registry.evaluations.get(LEAGUE, running).state == "stopped"
 
@@ -122,27 +112,3 @@ def test_evaluations_are_limited_and_listed_newest_first(registry: Registry) -> 
         submit(registry, max_active=5)
     assert [row.id for row in registry.evaluations.newest(LEAGUE, limit=2)] == numbers[:2:-1]
     assert [row.id for row in registry.evaluations.newest(LEAGUE, before=numbers[2], limit=5)] == numbers[1::-1]
-
-
-def test_unknown_leagues_and_evaluations_are_reported(registry: Registry) -> None:
-    with pytest.raises(UnknownLeague, match="chess"):
-        registry.evaluations.submit("chess", REQUEST, actor="bot", max_active=8)
-    with pytest.raises(UnknownEvaluation, match="has no evaluation 7"):
-        registry.evaluations.get(LEAGUE, 7)
-    with pytest.raises(UnknownLeague):
-        registry.evaluations.newest("chess")
-
-
-def test_a_repeated_submission_submits_nothing(registry: Registry) -> None:
-    key, _ = registry.keys.create("bot", ["evaluate"])
-    call = IdempotentCall(owner=key.id, key="first", digest="0" * 64)
-
-    def submit_with_key(call: IdempotentCall) -> EvaluationRow:
-        return registry.evaluations.submit(LEAGUE, REQUEST, actor="bot", key=key.id, max_active=8, call=call)
-
-    first = submit_with_key(call)
-    registry.evaluations.claim("a", 1)
-    assert (submit_with_key(call).id, submit_with_key(call).state) == (first.id, "running")
-    assert len(registry.evaluations.newest(LEAGUE)) == 1
-    with pytest.raises(KeyReused):
-        submit_with_key(replace(call, digest="1" * 64))

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 from sqlalchemy import text
 
-from league.errors import InvalidInput, InvalidReference, NameTaken, UnknownKey, UnknownLeague
+from league.errors import InvalidInput, InvalidReference, NameTaken, UnknownKey
 from league.registry.keys import SCOPES, TOKEN_LENGTH, digest
 from league.registry.registry import Registry
 from tests.support.leagues.registries import LEAGUE, registered
@@ -48,8 +48,6 @@ def test_invalid_keys_are_rejected(registry: Registry) -> None:
         registry.keys.create("bot", ["act", "root"])
     with pytest.raises(InvalidInput, match="needs a scope"):
         registry.keys.create("bot", [])
-    with pytest.raises(UnknownLeague, match="chess"):
-        registry.keys.create("bot", ["act"], only_leagues=["chess"])
     for rate in (0.0, -1.0, float("inf"), float("nan")):
         with pytest.raises(InvalidInput, match="positive"):
             registry.keys.create("bot", ["act"], rate=rate)

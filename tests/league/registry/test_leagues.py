@@ -1,10 +1,16 @@
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
 import pytest
 
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.errors import InterfaceChanged, InvalidReference, LeagueArchived, UnknownLeague
 from league.interface import Interface
+from league.refs import CheckpointRef
 from league.registry.aliases import ANY
+from league.registry.gateways import Gateway
 from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
@@ -72,9 +78,40 @@ def test_a_league_follows_the_code_of_its_environment(registry: Registry, monkey
 def test_an_unknown_league_is_reported_with_the_known_ones(empty: Registry) -> None:
     with pytest.raises(UnknownLeague, match="no league 'chess'; known: none yet"):
         empty.leagues.get("chess")
-    registered(empty)
-    with pytest.raises(UnknownLeague, match=f"no league 'chess'; known: {LEAGUE}"):
-        empty.versions.all("chess")
+    registry, moment = registered(empty), datetime.now(UTC)
+    by: dict[str, Any] = {"actor": "ada", "reason": "test"}
+    for use in (
+        lambda: registry.aliases.history("chess"),
+        lambda: registry.aliases.set("chess", "champion", 1, expected=None, **by),
+        lambda: registry.changes.token("chess"),
+        lambda: registry.evaluations.newest("chess"),
+        lambda: registry.evaluations.submit("chess", {}, actor="bot", max_active=8),
+        lambda: registry.gateways.announce(Gateway("http://127.0.0.1:1", "a", "chess", "training")),
+        lambda: registry.keys.create("bot", ["act"], only_leagues=["chess"]),
+        lambda: registry.nightly_runs.all("chess"),
+        lambda: registry.nightly_runs.open("chess", [1], 0.1),
+        lambda: registry.removal.remove_league("chess"),
+        lambda: registry.replicas.acknowledgements("chess"),
+        lambda: registry.retention.plan("chess", keep=1, before=moment),
+        lambda: registry.retention.retire("chess", keep=1, before=moment),
+        lambda: registry.runs.begin("chess", "first", algorithm="ppo", settings={}, seed=0, target=1),
+        lambda: registry.runs.newest("chess"),
+        lambda: registry.snapshots.get("chess", "leaderboard"),
+        lambda: registry.snapshots.put("chess", {"leaderboard": []}, mark="a"),
+        lambda: registry.strength.of_run("chess", "first"),
+        lambda: registry.traffic.set("chess", canary=None, **by),
+        lambda: registry.verdicts.all("chess"),
+        lambda: registry.verdicts.find("0f3a", "chess"),
+        lambda: registry.versions.all("chess"),
+        lambda: registry.versions.newest("chess"),
+        lambda: registry.versions.set_note(CheckpointRef("chess", 1), "x", actor="ada"),
+        lambda: publish(registry, "run/1", league="chess"),
+        lambda: Ledger(registry).counted("chess", SCHEDULE.conditions),
+        lambda: Ledger(registry).open(replace(SCHEDULE, league="chess")),
+        lambda: Ledger(registry).page("chess"),
+    ):
+        with pytest.raises(UnknownLeague, match=f"no league 'chess'; known: {LEAGUE}"):
+            use()
 
 
 def test_results_count_again_when_the_game_is_back(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:

@@ -8,17 +8,12 @@ import pytest
 from sqlalchemy import update
 
 from league.errors import EnvironmentMismatch, InvalidInput, NotPromotable, UnknownVersion, VersionRetired
-from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, MIXTURE, TRAINING, Manifest
 from league.registry.storage.tables import VersionTable
 from league.results.ledger import Ledger
 from tests.support.leagues.ledger_matches import SCHEDULE
-from tests.support.leagues.registries import LEAGUE, builder, config, publish, registered
-
-
-def promote(registry: Registry, version: int) -> None:
-    registry.aliases.set(LEAGUE, "champion", version, expected=ANY, actor="me", reason="test")
+from tests.support.leagues.registries import LEAGUE, builder, config, promote, publish, registered
 
 
 def test_a_mixture_is_a_version(registry: Registry) -> None:
@@ -49,16 +44,6 @@ def test_unsuitable_members_are_rejected(registry: Registry, subtests: pytest.Su
         with subtests.test(shares=shares), pytest.raises(error, match=message):
             registry.publisher.publish_mixture(LEAGUE, shares)
     assert [row.number for row in registry.versions.all(LEAGUE)] == [1, 2, 3, 4, 5], "nothing was published"
-
-
-def test_history_and_rollback_treat_it_as_one(registry: Registry) -> None:
-    registered(registry, versions=2)
-    promote(registry, 1)
-    promote(registry, registry.publisher.publish_mixture(LEAGUE, {1: 0.6, 2: 0.4}).number)
-    promote(registry, 2)
-    assert registry.aliases.rollback(LEAGUE, actor="me", reason="").version == 3
-    assert registry.aliases.rollback(LEAGUE, actor="me", reason="").version == 1
-    assert [event.version for event in registry.aliases.history(LEAGUE)] == [1, 3, 2, 3, 1]
 
 
 def test_members_of_another_interface_are_rejected(registry: Registry, tmp_path: Path) -> None:

@@ -289,7 +289,7 @@ class Changes(RuleBasedStateMachine):
     @invariant()
     def compare_often(self) -> None:
         self.steps += 1
-        if self.steps % 6 == 0:
+        if self.steps % 10 == 0:
             self.compare()
 
     def compare(self) -> None:
@@ -331,5 +331,5 @@ class Changes(RuleBasedStateMachine):
 
 def test_any_sequence_of_changes_leaves_the_registry_as_its_model(empty: Registry) -> None:
     # A sequence is not shortened, which takes minutes.
-    bounds = settings(examples(12), stateful_step_count=120, phases=[Phase.generate])
+    bounds = settings(examples(8), stateful_step_count=120, phases=[Phase.generate])
     run_state_machine_as_test(lambda: Changes(empty), settings=bounds)

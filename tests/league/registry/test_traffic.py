@@ -6,12 +6,11 @@ from datetime import timedelta
 import pytest
 from sqlalchemy import update
 
-from league.errors import Conflict, InvalidInput, KeyReused, NotReady, UnknownAlias, UnknownLeague, UnknownVersion
+from league.errors import Conflict, InvalidInput, NotReady, UnknownAlias, UnknownVersion
 from league.histograms import BOUNDS
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.database import clock
-from league.registry.storage.idempotency import IdempotentCall
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic
 from league.registry.storage.tables import ReplicaReportTable
 from tests.support.databases import on_both_databases
@@ -40,24 +39,7 @@ def test_only_existing_versions_get_traffic(versioned: Registry) -> None:
     ):
         with pytest.raises(error):
             set_traffic(versioned, canary=portion)
-    with pytest.raises(UnknownLeague):
-        versioned.traffic.set("nobody", canary=None, actor="ada", reason="test")
     assert versioned.traffic.history(LEAGUE) == []
-
-
-def test_a_repeated_call_gets_the_same_setting(versioned: Registry) -> None:
-    key, _ = versioned.keys.create("bot", ["promote"])
-    call = IdempotentCall(owner=key.id, key="first", digest="0" * 64)
-
-    def set_canary(share: float, call: IdempotentCall) -> Traffic:
-        return versioned.traffic.set(LEAGUE, canary=Portion(2, share), actor="bot", reason="test", call=call)
-
-    first = set_canary(0.1, call)
-    set_traffic(versioned, canary=None)
-    assert set_canary(0.1, call) == first
-    assert versioned.traffic.current(LEAGUE).canary is None
-    with pytest.raises(KeyReused):
-        set_canary(0.2, replace(call, digest="1" * 64))
 
 
 def shadow_counts(candidate: int = 2, requests: int = 10, **counts: int) -> ShadowCounts:

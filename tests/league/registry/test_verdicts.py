@@ -10,7 +10,6 @@ from league.errors import (
     InvalidInput,
     InvalidReference,
     NotFound,
-    UnknownLeague,
     UnknownVerdict,
     UnknownVersion,
 )
@@ -92,18 +91,13 @@ def test_a_nightly_run_is_opened_once(registry: Registry) -> None:
     assert ended.ended_at is not None
     assert registry.nightly_runs.open(LEAGUE, [1], 0.5).candidates == (1,)
     assert len(registry.nightly_runs.all(LEAGUE)) == 2
-    for unknown in (lambda: registry.nightly_runs.open("chess", [1], 0.1), lambda: registry.nightly_runs.all("chess")):
-        with pytest.raises(UnknownLeague):
-            unknown()
 
 
-def test_unknown_versions_verdicts_and_leagues_are_rejected(registry: Registry) -> None:
+def test_unknown_versions_and_verdicts_are_rejected(registry: Registry) -> None:
     with pytest.raises(UnknownVersion):
         registry.verdicts.open(LEAGUE, 9, "tictactoe@1", "schedule-1", SETTINGS)
     with pytest.raises(NotFound, match="no verdict 'schedule-9'"):
         registry.verdicts.close("schedule-9", "promote", EVIDENCE)
-    with pytest.raises(UnknownLeague):
-        registry.verdicts.all("chess")
 
 
 @pytest.fixture
@@ -125,8 +119,6 @@ def test_a_verdict_is_found_by_a_unique_beginning(registry: Registry, alike: tup
     for text in ("", "%", "_", "62d1", "1b", f"{first}0"):
         with pytest.raises(UnknownVerdict):
             registry.verdicts.find(text)
-    with pytest.raises(UnknownLeague):
-        registry.verdicts.find(first, "chess")
 
 
 def test_an_ambiguous_beginning_lists_the_candidates(registry: Registry, alike: tuple[str, str]) -> None:

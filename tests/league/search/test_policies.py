@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.gating.nightly import nightly
 from evaluation.matches.tournament import evaluate
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
@@ -51,7 +50,7 @@ def test_a_search_is_a_version(registry: Registry) -> None:
 
 def test_it_beats_the_version_without_a_search(registry: Registry) -> None:
     searching(registry, 1, "gumbel")
-    result = evaluate(LEAGUE, ["tictactoe@1", "tictactoe@2", "tictactoe@3"], registry=registry, blocks=20)
+    result = evaluate(LEAGUE, ["tictactoe@1", "tictactoe@2", "tictactoe@3"], registry=registry, blocks=12)
     scores = {standing.ref: standing.score for standing in result.leaderboard}
     assert min(scores["tictactoe@2"], scores["tictactoe@3"]) > scores["tictactoe@1"] + 0.2
 
@@ -60,13 +59,13 @@ def test_it_beats_the_version_without_a_search(registry: Registry) -> None:
 def test_games_depend_on_their_seeds_only(registry: Registry, actions: str) -> None:
     league = registry.leagues.get(LEAGUE)
     config = league.config.model_copy(update={"play": PlayConfig(actions=actions, opening_plies=2, num_envs=16)})
-    schedule = round_robin(config, league.interface, ["tictactoe@1", "tictactoe@2"], 8, 0)
+    schedule = round_robin(config, league.interface, ["tictactoe@1", "tictactoe@2"], 4, 0)
     together = MatchWorker(config, registry).play(schedule, range(schedule.length))
     alone = config.model_copy(update={"play": config.play.model_copy(update={"num_envs": 1})})
     assert MatchWorker(alone, registry).play(schedule, range(schedule.length)) == together
 
 
-def test_it_is_tested_promoted_and_rolled_back_like_others(registry: Registry) -> None:
+def test_it_is_promoted_and_rolled_back_like_others(registry: Registry) -> None:
     def champion() -> int:
         return registry.versions.resolve(CheckpointRef(LEAGUE, "champion")).number
 
@@ -74,9 +73,6 @@ def test_it_is_tested_promoted_and_rolled_back_like_others(registry: Registry) -
         registry.aliases.set(LEAGUE, "champion", number, expected=ANY, actor="test", reason="test")
 
     promote(1)
-    report = nightly(registry.leagues.get(LEAGUE).config, registry=registry)
-    assert [verdict.candidate for verdict in report.verdicts] == ["tictactoe@2"]
-    assert report.faults == ()
     promote(2)
     registry.traffic.set(LEAGUE, shadow=Portion(1, 0.1), actor="test", reason="test")
     assert champion() == 2

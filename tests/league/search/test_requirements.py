@@ -6,10 +6,11 @@ from numpy.typing import NDArray
 
 from league.config.league import LeagueConfig
 from league.environments.building import build, describe
-from league.environments.vector.connect_four import ConnectFour
+from league.environments.vector.tictactoe import TicTacToe
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.errors import EnvironmentMismatch
 from league.search.requirements import searchable
+from tests.support.environments.vector_copies import Chance
 
 
 def check(entry_point: str, **settings: object) -> Callable[[int], VectorEnv]:
@@ -19,7 +20,7 @@ def check(entry_point: str, **settings: object) -> Callable[[int], VectorEnv]:
     return searchable(config.environment, describe(build(config.environment), config))
 
 
-class Forgetful(ConnectFour):
+class Forgetful(TicTacToe):
     """Keeps a part of its state where `copy` does not expect it."""
 
     def __init__(self, num_envs: int) -> None:
@@ -33,35 +34,18 @@ class Forgetful(ConnectFour):
         raise AttributeError(name)
 
 
-class Unrestored(ConnectFour):
+class Unrestored(TicTacToe):
     """Does not implement `restore`."""
 
     restore = VectorEnv.restore
 
 
-class Doubled(ConnectFour):
+class Doubled(TicTacToe):
     """A win counts 2."""
 
     def step(self, env_ids: NDArray[np.int64], actions: NDArray[np.int64]) -> Sequence[AgentRows]:
         (rows,) = super().step(env_ids, actions)
         rows.rewards[:] *= 2
-        return (rows,)
-
-
-class Chance(ConnectFour):
-    """The seed decides whose win counts."""
-
-    def __init__(self, num_envs: int) -> None:
-        super().__init__(num_envs)
-        self._signs = np.ones(num_envs)
-
-    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
-        self._signs[env_ids] = 1 - 2 * (seeds % 2)
-        return super().reset(env_ids, seeds)
-
-    def step(self, env_ids: NDArray[np.int64], actions: NDArray[np.int64]) -> Sequence[AgentRows]:
-        (rows,) = super().step(env_ids, actions)
-        rows.rewards[:] *= self._signs[rows.envs]
         return (rows,)
 
 
@@ -87,4 +71,4 @@ def test_a_game_that_search_versions_cannot_play_is_refused() -> None:
         (Chance, r"cannot be searched: its games depend on chance: copy \d+, seed "),
     ):
         with pytest.raises(EnvironmentMismatch, match=reason):
-            check("pettingzoo.classic.connect_four_v3", vector=f"{game.__module__}:{game.__name__}")
+            check("pettingzoo.classic.tictactoe_v3", vector=f"{game.__module__}:{game.__name__}")

@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import cache
 from itertools import product
 from random import Random
 
@@ -257,7 +258,8 @@ def test_tactics_are_found_and_values_of_finished_games_are_exact(rule: Callable
     assert result.values.tolist() == [np.float32(49 / 50), 0]
 
 
-def played(game: type[TicTacToe] | type[ConnectFour], actions: Sequence[int]) -> AgentRows:
+@cache
+def played(game: type[TicTacToe] | type[ConnectFour], actions: tuple[int, ...]) -> AgentRows:
     return positions(game(1), np.array([0]), [actions], is_open=False)
 
 

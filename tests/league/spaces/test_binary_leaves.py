@@ -75,23 +75,16 @@ EIGHT = b64(np.arange(2, dtype="<f4").tobytes())
 BAD_ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
     "another dtype": ({"b64": EIGHT, "dtype": "float64"}, "has dtype 'float64', expected float32"),
     "another order": ({"b64": EIGHT, "dtype": ">f4"}, "has dtype '>f4'"),
-    "an object": ({"b64": EIGHT, "dtype": "object"}, "has dtype 'object'"),
     "a deep dtype": ({"b64": EIGHT, "dtype": deep(1000)}, "not a string"),
     "another shape": ({"b64": EIGHT, "shape": [2, 1]}, "has shape [2, 1], expected [2]"),
     "a shape of strings": ({"b64": EIGHT, "shape": ["2"]}, "not a list of integers"),
     "a deep shape": ({"b64": EIGHT, "shape": deep(1000)}, "not a list of integers"),
     "too few bytes": ({"b64": b64(bytes(7))}, "holds 7 bytes, expected 8"),
-    "too many bytes": ({"b64": b64(bytes(12))}, "holds 12 bytes, expected 8"),
-    "nothing": ({"b64": ""}, "holds 0 bytes, expected 8"),
     "not a string": ({"b64": [1]}, "not a string"),
-    "null": ({"b64": None}, "not a string"),
     "not valid base64": ({"b64": "*" * 12}, "not valid base64"),
     "the alphabet of URLs": ({"b64": "__________8="}, "not valid base64"),
-    "without padding": ({"b64": EIGHT.rstrip("=")}, "not valid base64"),
-    "blanks": ({"b64": EIGHT[:4] + "\n" + EIGHT[4:]}, "not valid base64"),
     "beyond ASCII": ({"b64": "ÄÄÄÄ"}, "not valid base64"),
     "an unknown key": ({"b64": EIGHT, "order": "C"}, "unknown key 'order'"),
-    "png, too": ({"b64": EIGHT, "png": EIGHT}, "unknown key 'png'"),
 }
 
 
@@ -104,21 +97,16 @@ GOOD = png(GREY)
 BAD_PICTURES: dict[str, tuple[Any, str]] = {
     "not valid base64": ("*", "not valid base64"),
     "not a string": (3, "not a string"),
-    "an object": ({"png": b64(GOOD)}, "not a string"),
     "a list of null": ([None], "not a string"),
     "none": ([], "holds 0 images"),
     "too many": ([b64(GOOD)] * 300, "holds 300 images, expected 1 to 256"),
     "a JPEG": (b64(b"\xff\xd8\xff\xe0" + bytes(64)), "is not a PNG image"),
-    "nothing": ("", "is not a PNG image"),
     "only a signature": (b64(SIGNATURE), "is not a PNG image"),
     "half a head": (b64(GOOD[:20]), "truncated"),
-    "only a head": (b64(SIGNATURE + head(3, 4)), "cannot be decoded"),
     "another size": (b64(png(np.zeros((4, 3), np.uint8))), "4 × 3 pixels (height × width), expected 3 × 4"),
     "huge": (b64(SIGNATURE + head(2**31 - 1, 2**31 - 1)), "expected 3 × 4"),
     "RGB": (b64(png(np.zeros((3, 4, 3), np.uint8))), "3 channels, expected 1"),
-    "two": ([b64(GOOD)] * 2, "2 channels, expected 1"),
     "16 bits": (b64(SIGNATURE + head(3, 4, bits=16)), "16 bits"),
-    "1 bit": (b64(SIGNATURE + head(3, 4, bits=1)), "1 bits"),
     "a palette": (b64(SIGNATURE + head(3, 4, colour=3)), "a palette"),
     "no pixels": (b64(SIGNATURE + head(3, 4) + chunk(b"IEND", b"")), "cannot be decoded"),
     "pixels of another kind": (b64(GOOD.replace(b"IDAT", b"iDAT")), "cannot be decoded"),
@@ -135,7 +123,7 @@ def test_the_decoded_size_of_images_is_limited() -> None:
         check_decoded_size("observation", [*rows, [0]], large)
 
 
-@examples(300)
+@examples(150)
 @given(
     image=st.sampled_from([GOOD, png(np.zeros((3, 4, 4), np.uint8), compress_level=0)]),
     at=st.integers(0, 200),
@@ -153,12 +141,12 @@ def test_a_damaged_image_is_rejected_or_has_its_shape(image: bytes, at: int, put
         assert (read.shape, read.dtype) == (shape, np.uint8)
 
 
-@examples(200)
+@examples(100)
 @given(
     chunks=st.lists(st.tuples(st.sampled_from([b"IHDR", b"IDAT", b"IEND", b"PLTE", b"tEXt"]), st.binary(max_size=30)))
 )
 def test_chunks_in_any_order_are_rejected_or_decoded(chunks: list[tuple[bytes, bytes]]) -> None:
-    image = SIGNATURE + head(2, 2) + b"".join(chunk(*each) for each in chunks)
+    image = SIGNATURE + head(2, 2) + b"".join(chunk(*part) for part in chunks)
     with suppress(ObservationError):
         assert decode("observation", {"png": b64(image)}, leaf((2, 2))).shape == (2, 2)
 

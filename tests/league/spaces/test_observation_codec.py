@@ -55,10 +55,10 @@ def values(space: Space) -> st.SearchStrategy[Any]:
 def test_observations_survive_json(space: Space, data: st.DataObject) -> None:
     batch = data.draw(st.lists(values(space), min_size=1, max_size=3))
     document = orjson.loads(orjson.dumps(batch, option=orjson.OPT_SERIALIZE_NUMPY))
-    found = ObservationReader(space).read(document)
+    decoded = ObservationReader(space).read(document)
     expected = [tensors(space, value) for value in batch]
-    assert found.keys() == expected[0].keys()
-    for name, array in found.items():
+    assert decoded.keys() == expected[0].keys()
+    for name, array in decoded.items():
         assert array.dtype == expected[0][name].dtype
         np.testing.assert_array_equal(array, np.stack([row[name] for row in expected]))
 

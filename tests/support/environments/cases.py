@@ -22,29 +22,25 @@ class Case:
     training: dict[str, Any] = field(default_factory=dict)
 
     def league(self) -> LeagueConfig:
-        document: dict[str, Any] = {
-            "league": self.entry_point.rpartition(".")[2],
-            "environment": {
-                "entry_point": self.entry_point,
-                "kwargs": self.kwargs,
-                "wrappers": list(self.wrappers),
-            },
-            "play": {"num_envs": 4},
-            "training": {
-                "runners": 0,
-                "num_envs": 2,
-                "train_batch_size": 64,
-                "minibatch_size": 32,
-                "epochs": 1,
-                "hidden": [16],
-            }
-            | self.training,
+        environment = {"entry_point": self.entry_point, "kwargs": self.kwargs, "wrappers": list(self.wrappers)}
+        training = {
+            "runners": 0,
+            "num_envs": 2,
+            "train_batch_size": 64,
+            "minibatch_size": 32,
+            "epochs": 1,
+            "hidden": [16],
         }
-        if self.sides is not None:
-            document["sides"] = self.sides
-        if self.policies is not None:
-            document["policies"] = self.policies
-        return LeagueConfig.from_mapping(document)
+        return LeagueConfig.from_mapping(
+            {
+                "league": self.entry_point.rpartition(".")[2],
+                "environment": environment,
+                "sides": self.sides,
+                "policies": self.policies,
+                "play": {"num_envs": 4},
+                "training": training | self.training,
+            }
+        )
 
 
 CLASSIC = "pettingzoo.classic."

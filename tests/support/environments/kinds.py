@@ -39,10 +39,8 @@ class Kind:
         environment = {"entry_point": self.entry_point, "kwargs": self.kwargs}
         # A game is then a function of its policies and its seed, which the tests compare.
         play = {"actions": "greedy"}
-        document: dict[str, Any] = {"league": "kind", "environment": environment, "sides": self.sides, "play": play}
-        if self.policies:
-            document["policies"] = self.policies
-        return LeagueConfig.from_mapping(document)
+        document = {"league": "kind", "environment": environment, "sides": self.sides, "play": play}
+        return LeagueConfig.from_mapping(document | {"policies": self.policies})
 
     @cached_property
     def interface(self) -> Interface:

@@ -47,5 +47,5 @@ def spaces(env: Any) -> tuple[Space, Space]:
 
 def observations(envs: Sequence[Any]) -> dict[str, np.ndarray]:
     """The batch of what the agents to act observe."""
-    values = [tensors(spaces(env)[0], env.observe(env.agent_selection)) for env in envs]
-    return {name: np.stack([value[name] for value in values]) for name in values[0]}
+    values = {id(env): tensors(spaces(env)[0], env.observe(env.agent_selection)) for env in envs}
+    return {name: np.stack([values[id(env)][name] for env in envs]) for name in values[id(envs[0])]}

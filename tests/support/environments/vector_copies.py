@@ -1,4 +1,4 @@
-"""Vectorised environments for tests: loops over copies of small stock environments."""
+"""Vectorised environments for tests: loops over copies of small stock environments, and a game of chance."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from league.config.environment import EnvironmentConfig
 from league.environments.adapters import Report, adapter_for, splitter
 from league.environments.building import build, observation_space
+from league.environments.vector.tictactoe import TicTacToe
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.spaces import inputs
 from league.spaces.conversion import from_gymnasium
@@ -88,10 +89,6 @@ class VectorFuse(VectorCopies):
     entry_point = "tests.support.environments.fuses:fuse"
 
 
-class VectorSpread(VectorCopies):
-    entry_point = "mpe2.simple_spread_v3"
-
-
 class Faulty(VectorMeeting):
     """Raises in its third step, which the stock environment does not."""
 
@@ -102,3 +99,17 @@ class Faulty(VectorMeeting):
         if self._steps == 3:
             raise ArithmeticError("the array is on fire")
         return super().step(env_ids, actions)
+
+
+class Chance(TicTacToe):
+    """The seed decides which player's win counts after the fourth move."""
+
+    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
+        self._seeds = getattr(self, "_seeds", np.zeros(self.num_envs, dtype=np.int64))
+        self._seeds[env_ids] = seeds
+        return super().reset(env_ids, seeds)
+
+    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
+        (rows,) = super().step(env_ids, actions)
+        rows.rewards[:] *= np.where(self._seeds[rows.envs] % 2 == 0, 1, -1)
+        return (rows,)

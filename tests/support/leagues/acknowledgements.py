@@ -1,10 +1,15 @@
 """Acknowledgements of replicas, without replicas."""
 
 from collections.abc import Mapping
+from datetime import timedelta
 from types import MappingProxyType
 
+from sqlalchemy import update
+
 from league.registry.registry import Registry
+from league.registry.storage.database import clock
 from league.registry.storage.rows import ReadPosition, ServedState
+from league.registry.storage.tables import ReplicaTable
 
 
 def acknowledge(
@@ -35,3 +40,9 @@ def read_everything(registry: Registry, replica: str) -> None:
     if not registry.replicas.acknowledge(replica, position, {}):
         registry.replicas.register(replica, {})
         registry.replicas.acknowledge(replica, position, {})
+
+
+def silence(registry: Registry, replica: str, by: timedelta) -> None:
+    """Let the last report of a replica be older."""
+    with registry.database.write() as session:
+        session.execute(update(ReplicaTable).filter_by(replica=replica).values(seen_at=clock(session) - by))

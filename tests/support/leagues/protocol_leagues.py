@@ -9,7 +9,7 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import Box, DictSpace, Discrete
 from tests.support.leagues.served_leagues import everything, promote, publish, register
-from tests.support.policies.graphs import serialized
+from tests.support.policies.graphs import serialized, tensor
 
 DTYPES = (
     ["bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64"]
@@ -64,7 +64,7 @@ def sums() -> bytes:
         ]
         parts.append(f"{dtype}_sum")
     nodes.append(helper.make_node("Concat", parts, ["action"], axis=1))
-    inputs = [_value(f"observation.{dtype}", dtype, (2, 3)) for dtype in DTYPES]
+    inputs = [tensor(f"observation.{dtype}", dtype, 2, 3) for dtype in DTYPES]
     return _graph(nodes, inputs, "float32", (len(DTYPES),), {"axis": np.array([1])}, dist_inputs="action")
 
 
@@ -78,7 +78,7 @@ def moves() -> bytes:
         helper.make_node("Where", ["is_illegal", "low", "logits"], ["action_dist_inputs"]),
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]
-    inputs = [_value("observation", "bool", PLANES), _value("action_mask", "int8", (MOVES,))]
+    inputs = [tensor("observation", "bool", *PLANES), tensor("action_mask", "int8", MOVES)]
     constants = {
         "begin": np.array([0]),
         "end": np.array([MOVES]),
@@ -98,7 +98,7 @@ def brightness() -> bytes:
         helper.make_node("Mul", ["mean", "scale"], ["action"]),
     ]
     constants = {"axis": np.array([1]), "scale": np.float32(0.001)}
-    return _graph(nodes, [_value("observation", "uint8", FRAME)], "float32", (1,), constants, dist_inputs="action")
+    return _graph(nodes, [tensor("observation", "uint8", *FRAME)], "float32", (1,), constants, dist_inputs="action")
 
 
 def table() -> bytes:
@@ -108,7 +108,7 @@ def table() -> bytes:
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]
     logits = np.array([[0, 1, 2], [2, 1, 0], [0, 2, 1], [1, 0, 2]], np.float32)
-    return _graph(nodes, [_value("observation", "int64", ())], "int64", (), {"table": logits}, width=3)
+    return _graph(nodes, [tensor("observation", "int64")], "int64", (), {"table": logits}, width=3)
 
 
 def _graph(
@@ -123,11 +123,7 @@ def _graph(
     if dist_inputs:
         nodes.append(helper.make_node("Concat", [dist_inputs, dist_inputs], ["action_dist_inputs"], axis=1))
     outputs = [
-        _value("action", dtype, shape),
-        _value("action_dist_inputs", "float32", (width or 2 * shape[0],)),
+        tensor("action", dtype, *shape),
+        tensor("action_dist_inputs", "float32", width or 2 * shape[0]),
     ]
     return serialized(nodes, inputs, outputs, constants)
-
-
-def _value(name: str, dtype: str, shape: tuple[int, ...]) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(np.dtype(dtype)), ["batch", *shape])

@@ -1,15 +1,18 @@
 """A small league to register and publish: the spaces of tic-tac-toe, and files of a few bytes."""
 
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import update
+
 from league.config.league import LeagueConfig
 from league.interface import AgentInterface, Interface
+from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest, Parity, PolicyManifest, Tensor
-from league.registry.storage.rows import VersionRow
+from league.registry.storage.rows import EvaluationRow, RunRow, VersionRow
 from league.spaces import Box, DictSpace, Discrete
 
 LEAGUE = "tictactoe"
@@ -95,6 +98,16 @@ def registered(registry: Registry, league: str = LEAGUE, versions: int = 0) -> R
     for i in range(versions):
         publish(registry, f"run/{i}", league)
     return registry
+
+
+def promote(registry: Registry, version: int, league: str = LEAGUE) -> None:
+    """Make a version the champion, whichever it is."""
+    registry.aliases.set(league, "champion", version, expected=ANY, actor="test", reason="test")
+
+
+def expire_heartbeats(registry: Registry, table: type[RunRow] | type[EvaluationRow]) -> None:
+    with registry.database.write() as session:
+        session.execute(update(table).values(heartbeat_at=datetime.now(UTC) - timedelta(days=1)))
 
 
 def leftovers(registry: Registry, league: str = LEAGUE) -> list[str]:

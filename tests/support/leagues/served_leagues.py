@@ -1,11 +1,9 @@
 """Leagues with each kind of space, published from small handwritten graphs."""
 
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import onnx
 from onnx import TensorProto, helper
 
 from league.conditions import ActionSelection
@@ -14,11 +12,12 @@ from league.interface import AgentInterface, Interface
 from league.policies.probes import Probes
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
-from league.registry.storage.manifest import PROBES, Manifest, Parity, PolicyManifest, Tensor
+from league.registry.storage.manifest import PROBES, Manifest
 from league.registry.storage.rows import VersionRow
 from league.settings import Storage
 from league.spaces import Box, DictSpace, Discrete
-from tests.support.policies.graphs import continuous, counting, masked_mlp, serialized
+from tests.support.leagues.manifests import manifest, policy_manifest
+from tests.support.policies.graphs import continuous, counting, masked_mlp, serialized, tensor
 from tests.support.templates import copy_of
 
 BOARD = AgentInterface(
@@ -57,14 +56,8 @@ def nested() -> bytes:
         helper.make_node("Concat", ["negative", "column"], ["action_dist_inputs"], axis=1),
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]
-    inputs = [
-        helper.make_tensor_value_info("observation.mode", TensorProto.INT64, ["batch"]),
-        helper.make_tensor_value_info("observation.sense.speed", TensorProto.FLOAT, ["batch", 2]),
-    ]
-    outputs = [
-        helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
-        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
-    ]
+    inputs = [tensor("observation.mode", "int64"), tensor("observation.sense.speed", "float32", 2)]
+    outputs = [tensor("action", "int64"), tensor("action_dist_inputs", "float32", 2)]
     return serialized(nodes, inputs, outputs, {"axis": np.array([1])})
 
 
@@ -147,43 +140,12 @@ def _builder(
             (directory / f"{policy}.onnx").write_bytes(graph)
         for policy, recorded in probes.items():
             (directory / f"{policy}{PROBES}").write_bytes(recorded.to_bytes())
-        return Manifest(
-            league=league,
-            version=number,
-            created_at=datetime.now(UTC),
-            interface=row.interface,
-            policies={
-                policy: _policy(row.interface.of_policy(policy), policy, graph, policy in probes)
-                for policy, graph in graphs.items()
-            },
-            environment=row.config.environment,
-            environment_digest=row.environment_digest,
-            algorithm=algorithm,
-            settings={},
-            seed=0,
-            steps=number,
-            stack={},
-        )
+        policies = {
+            policy: policy_manifest(
+                row.interface.of_policy(policy), policy, graph, probes=f"{policy}{PROBES}" if policy in probes else None
+            )
+            for policy, graph in graphs.items()
+        }
+        return manifest(row, number, policies, algorithm=algorithm)
 
     return build
-
-
-def _policy(spaces: AgentInterface, policy: str, graph: bytes, has_probes: bool) -> PolicyManifest:
-    model = onnx.load_from_string(graph).graph
-    inputs, outputs = (tuple(_tensor(value) for value in values) for values in (model.input, model.output))
-    return PolicyManifest(
-        file=f"{policy}.onnx",
-        observation=spaces.observation,
-        action=spaces.action,
-        inputs=inputs,
-        outputs=outputs,
-        state=tuple(tensor for tensor in inputs if tensor.name.startswith("state_in_")),
-        parity=Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
-        probes=f"{policy}{PROBES}" if has_probes else None,
-    )
-
-
-def _tensor(value: onnx.ValueInfoProto) -> Tensor:
-    tensor = value.type.tensor_type
-    shape = tuple(dimension.dim_value or None for dimension in tensor.shape.dim)
-    return Tensor(name=value.name, dtype=helper.tensor_dtype_to_np_dtype(tensor.elem_type).name, shape=shape)

@@ -5,23 +5,23 @@ opponent has two marks, and prefers the squares of such lines over a fixed order
 which of the two it uses.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from datetime import UTC, datetime
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
-from onnx import NodeProto, TensorProto, ValueInfoProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.interface import AgentInterface
 from league.registry.registry import Registry
-from league.registry.storage.manifest import EXPLOITER, MAIN, Manifest, Parity, PolicyManifest, Tensor
+from league.registry.storage.manifest import EXPLOITER, MAIN, Manifest
 from league.registry.storage.rows import LeagueRow, VersionRow
 from league.settings import Storage
 from league.spaces import OBSERVATION, Box, Discrete, inputs
+from tests.support.leagues.manifests import manifest, policy_manifest
+from tests.support.policies.graphs import serialized, tensor
 
 LEAGUE = "tictactoe"
 LINES = ((0, 1, 2), (3, 4, 5), (6, 7, 8), (0, 3, 6), (1, 4, 7), (2, 5, 8), (0, 4, 8), (2, 4, 6))
@@ -81,14 +81,14 @@ def linear(spaces: AgentInterface, seed: int = 0, memory: bool = False, chosen: 
         "rates": np.arange(1, outputs + 1, dtype=np.float32)[None],
         "strength": np.array(20, np.float32),
     }
-    graph_inputs, graph_outputs = [_info(OBSERVATION, TensorProto.FLOAT, width)], []
+    graph_inputs, graph_outputs = [tensor(OBSERVATION, "float32", width)], []
     nodes = [
         helper.make_node("MatMul", [OBSERVATION, "weights"], ["seen"]),
         helper.make_node("Add", ["seen", "bias"], ["steady"]),
     ]
     if memory:
-        graph_inputs.append(_info("state_in_0", TensorProto.FLOAT, 1))
-        graph_outputs.append(_info("state_out_0", TensorProto.FLOAT, 1))
+        graph_inputs.append(tensor("state_in_0", "float32", 1))
+        graph_outputs.append(tensor("state_out_0", "float32", 1))
         nodes += [
             helper.make_node("Add", ["state_in_0", "one"], ["state_out_0"]),
             helper.make_node("MatMul", ["state_in_0", "rates"], ["angles"]),
@@ -108,8 +108,8 @@ def linear(spaces: AgentInterface, seed: int = 0, memory: bool = False, chosen: 
             helper.make_node("Concat", ["preferred", "preferred"], ["action_dist_inputs"], axis=1),
         ]
         graph_outputs = [
-            _info("action", TensorProto.FLOAT, outputs),
-            _info("action_dist_inputs", 1, 2 * outputs),
+            tensor("action", "float32", outputs),
+            tensor("action_dist_inputs", "float32", 2 * outputs),
             *graph_outputs,
         ]
     else:
@@ -117,8 +117,8 @@ def linear(spaces: AgentInterface, seed: int = 0, memory: bool = False, chosen: 
             helper.make_node("Identity", ["preferred"], ["action_dist_inputs"]),
             helper.make_node("ArgMax", ["preferred"], ["action"], axis=1, keepdims=0),
         ]
-        graph_outputs = [_info("action", TensorProto.INT64), _info("action_dist_inputs", 1, outputs), *graph_outputs]
-    return _model(nodes, graph_inputs, graph_outputs, weights)
+        graph_outputs = [tensor("action", "int64"), tensor("action_dist_inputs", "float32", outputs), *graph_outputs]
+    return serialized(nodes, graph_inputs, graph_outputs, weights)
 
 
 def chase_landmark(spaces: AgentInterface) -> bytes:
@@ -139,10 +139,6 @@ def _logits(spaces: AgentInterface) -> int:
         case Box(shape=(m,)):
             return m
     raise AssertionError(f"no linear graph for {spaces.action}")
-
-
-def _info(name: str, dtype: int, *shape: int) -> ValueInfoProto:
-    return helper.make_tensor_value_info(name, dtype, ["batch", *shape])
 
 
 def graph(
@@ -181,21 +177,9 @@ def graph(
         helper.make_node("Where", ["legal", "wanted", "illegal"], ["action_dist_inputs"]),
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]
-    graph_inputs = [_info("observation", TensorProto.INT8, 3, 3, 2), _info("action_mask", TensorProto.INT8, 9)]
-    graph_outputs = [_info("action", TensorProto.INT64), _info("action_dist_inputs", TensorProto.FLOAT, 9)]
-    return _model(nodes, graph_inputs, graph_outputs, weights)
-
-
-def _model(
-    nodes: Sequence[NodeProto],
-    graph_inputs: Sequence[ValueInfoProto],
-    graph_outputs: Sequence[ValueInfoProto],
-    weights: Mapping[str, NDArray],
-) -> bytes:
-    tensors = [numpy_helper.from_array(value, name) for name, value in weights.items()]
-    body = helper.make_graph(nodes, "by_hand", graph_inputs, graph_outputs, tensors)
-    model = helper.make_model(body, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    return bytes(model.SerializeToString())
+    graph_inputs = [tensor("observation", "int8", 3, 3, 2), tensor("action_mask", "int8", 9)]
+    graph_outputs = [tensor("action", "int64"), tensor("action_dist_inputs", "float32", 9)]
+    return serialized(nodes, graph_inputs, graph_outputs, weights)
 
 
 def _builder(
@@ -207,47 +191,12 @@ def _builder(
             (directory / f"{name}.onnx").write_bytes(graph)
             if value is not None:
                 (directory / f"{name}.value.onnx").write_bytes(value)
-            spaces = row.interface.of_policy(name)
-            policies[name] = PolicyManifest(
-                file=f"{name}.onnx",
-                observation=spaces.observation,
-                action=spaces.action,
-                inputs=_tensors(graph, "input"),
-                outputs=_tensors(graph, "output"),
-                state=tuple(tensor for tensor in _tensors(graph, "input") if tensor.name.startswith("state_in_")),
-                parity=Parity(observations=2000, mismatches=0, near_ties=0, max_difference=0.0),
-                value=None if value is None else f"{name}.value.onnx",
-            )
-        return Manifest(
-            league=row.slug,
-            version=number,
-            created_at=datetime.now(UTC),
-            interface=row.interface,
-            policies=policies,
-            environment=row.config.environment,
-            environment_digest=row.environment_digest,
-            algorithm="ppo",
-            settings=settings,
-            seed=0,
-            steps=number,
-            role=MAIN if exploits is None else EXPLOITER,
-            exploits=exploits,
-            stack={},
-        )
+            files = {} if value is None else {"value": f"{name}.value.onnx"}
+            policies[name] = policy_manifest(row.interface.of_policy(name), name, graph, **files)
+        role = MAIN if exploits is None else EXPLOITER
+        return manifest(row, number, policies, settings=settings, role=role, exploits=exploits)
 
     return build
-
-
-def _tensors(graph: bytes, kind: str) -> tuple[Tensor, ...]:
-    body = onnx.load_model_from_string(graph).graph
-    return tuple(
-        Tensor(
-            name=node.name,
-            dtype=helper.tensor_dtype_to_np_dtype(node.type.tensor_type.elem_type).name,
-            shape=(None, *(axis.dim_value for axis in node.type.tensor_type.shape.dim[1:])),
-        )
-        for node in (body.input if kind == "input" else body.output)
-    )
 
 
 def playable(registry: Registry) -> None:

@@ -8,36 +8,33 @@ COUNTING = "tests.support.environments.counting:counting"
 ENVIRONMENTS = "tests.support.environments.training_environments"
 
 
+def small(
+    entry_point: str, kwargs: dict[str, Any] | None = None, policies: Any = None, name: str = "small", **training: Any
+) -> LeagueConfig:
+    """A league of any environment, with a small network."""
+    settings: dict[str, Any] = {"runners": 0, "num_envs": 3, "hidden": [8], "seed": 5}
+    document: dict[str, Any] = {"league": name, "environment": {"entry_point": entry_point, "kwargs": kwargs or {}}}
+    document |= {"training": settings | training} | ({"policies": policies} if policies else {})
+    return LeagueConfig.from_mapping(document)
+
+
 def counting(lives: list[int], truncated: list[int], **training: Any) -> LeagueConfig:
     """A policy for each player, as their spaces differ."""
-    return LeagueConfig.from_mapping(
-        {
-            "league": "counting",
-            "environment": {"entry_point": COUNTING, "kwargs": {"lives": lives, "truncated": truncated}},
-            "policies": {f"policy_{i}": [f"player_{i}"] for i in range(len(lives))},
-            "training": {"runners": 0, "num_envs": 3, "hidden": [8], "seed": 5} | training,
-        }
-    )
+    policies = {f"policy_{i}": [f"player_{i}"] for i in range(len(lives))}
+    return small(COUNTING, {"lives": lives, "truncated": truncated}, policies, "counting", **training)
 
 
 def tictactoe(**training: Any) -> LeagueConfig:
     """One policy for both players, with a small network."""
-    return LeagueConfig.from_mapping(
-        {
-            "league": "tictactoe",
-            "environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"},
-            "training": {"runners": 0, "num_envs": 4, "hidden": [16], "seed": 5} | training,
-        }
-    )
+    settings: dict[str, Any] = {"num_envs": 4, "hidden": [16]}
+    return small("pettingzoo.classic.tictactoe_v3", name="tictactoe", **settings | training)
 
 
 def solvable(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
     """A training environment, with settings that solve it in a few updates."""
-    settings = {
-        "runners": 0,
+    settings: dict[str, Any] = {
         "num_envs": 16,
         "hidden": [32],
-        "seed": 5,
         "train_batch_size": 1024,
         "minibatch_size": 128,
         "epochs": 6,
@@ -45,26 +42,17 @@ def solvable(name: str, kwargs: dict[str, Any] | None = None, policies: Any = No
         "gamma": 0.9,
         "entropy": 0.001,
     }
-    return LeagueConfig.from_mapping(
-        {
-            "league": name,
-            "environment": {"entry_point": f"{ENVIRONMENTS}:{name}", "kwargs": kwargs or {}},
-            "policies": policies or {"shared": ["*"]},
-            "training": settings | training,
-        }
-    )
+    return small(f"{ENVIRONMENTS}:{name}", kwargs, policies or {"shared": ["*"]}, name, **settings | training)
 
 
 def solvable_by_dqn(
     name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any
 ) -> LeagueConfig:
     """A training environment, with settings of DQN that solve it in a few updates."""
-    settings = {
+    settings: dict[str, Any] = {
         "algorithm": "dqn",
-        "runners": 0,
         "num_envs": 16,
         "hidden": [32],
-        "seed": 5,
         "lr": 0.003,
         "gamma": 0.9,
         "learning_starts": 256,
@@ -72,41 +60,25 @@ def solvable_by_dqn(
         "target_every": 20,
         "exploration": {"steps": 4000},
     }
-    return LeagueConfig.from_mapping(
-        {
-            "league": name,
-            "environment": {"entry_point": f"{ENVIRONMENTS}:{name}", "kwargs": kwargs or {}},
-            "policies": policies or {"shared": ["*"]},
-            "training": settings | training,
-        }
-    )
+    return small(f"{ENVIRONMENTS}:{name}", kwargs, policies or {"shared": ["*"]}, name, **settings | training)
 
 
 def qmix_league(name: str, kwargs: dict[str, Any] | None = None, policies: Any = None, **training: Any) -> LeagueConfig:
     """A training environment, with all agents in one team, and settings of QMIX that solve it in a few updates."""
-    settings = {"algorithm": "qmix", "groups": {"team": ["*"]}, "mixing_width": 8}
+    settings: dict[str, Any] = {"algorithm": "qmix", "groups": {"team": ["*"]}, "mixing_width": 8}
     return solvable_by_dqn(name, kwargs, policies, **(settings | training))
 
 
 def maddpg(name: str, kwargs: dict[str, Any], policies: Any, **training: Any) -> LeagueConfig:
     """A training environment, with settings that solve it in some thousand actions."""
-    settings = {
+    settings: dict[str, Any] = {
         "algorithm": "maddpg",
-        "runners": 0,
         "num_envs": 16,
         "hidden": [32],
-        "seed": 5,
         "replay_capacity": 20_000,
         "learning_starts": 256,
         "batch_size": 256,
         "update_every": 32,
         "exploration": {"initial": 0.5, "final": 0.1, "steps": 20_000},
     }
-    return LeagueConfig.from_mapping(
-        {
-            "league": name,
-            "environment": {"entry_point": f"{ENVIRONMENTS}:{name}", "kwargs": kwargs},
-            "policies": policies,
-            "training": settings | training,
-        }
-    )
+    return small(f"{ENVIRONMENTS}:{name}", kwargs, policies, name, **settings | training)

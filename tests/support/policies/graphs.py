@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, ValueInfoProto, helper, numpy_helper
 
-OBSERVATION = ("observation", TensorProto.INT8)
-MASK = ("action_mask", TensorProto.INT8)
+
+def tensor(name: str, dtype: str, *shape: int) -> ValueInfoProto:
+    """An input or output of a graph, for each row of a batch."""
+    return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(np.dtype(dtype)), ["batch", *shape])
 
 
 def masked_mlp(
@@ -28,7 +30,7 @@ def masked_mlp(
         helper.make_node("Cast", ["observation"], ["cast"], to=TensorProto.FLOAT),
         helper.make_node("Flatten", ["cast"], ["flat"], axis=1),
     ]
-    constants = {
+    constants: dict[str, np.ndarray | np.generic] = {
         "start": np.int64(start),
         "zero": np.int8(0),
         "low": np.float32(-1e9),
@@ -44,19 +46,13 @@ def masked_mlp(
         helper.make_node("ArgMax", ["action_dist_inputs"], ["best"], axis=1, keepdims=0),
         helper.make_node("Add", ["best", "start"], ["action"]),
     ]
-    inputs = [
-        helper.make_tensor_value_info(*OBSERVATION, ["batch", *shape]),
-        helper.make_tensor_value_info(*MASK, ["batch", actions]),
-    ]
-    outputs = [
-        helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
-        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", actions]),
-    ]
+    inputs = [tensor("observation", "int8", *shape), tensor("action_mask", "int8", actions)]
+    outputs = [tensor("action", "int64"), tensor("action_dist_inputs", "float32", actions)]
     if has_value:
         width, name = last_hidden
         constants["wv"] = (random.normal(size=width) / np.sqrt(width)).astype(np.float32)
         nodes += [helper.make_node("MatMul", [name, "wv"], ["zv"]), helper.make_node("Tanh", ["zv"], ["value"])]
-        outputs.append(helper.make_tensor_value_info("value", TensorProto.FLOAT, ["batch"]))
+        outputs.append(tensor("value", "float32"))
     return serialized(nodes, inputs, outputs, constants)
 
 
@@ -67,17 +63,12 @@ ENDLESS = 84
 def endless_mlp(seed: int = 0) -> bytes:
     """`masked_mlp` with a loop that does not end if the first observation of a batch sums to ENDLESS."""
     model = onnx.load_from_string(masked_mlp(seed=seed))
-    value_infos = [
-        helper.make_tensor_value_info("turn", TensorProto.INT64, []),
-        helper.make_tensor_value_info("on", TensorProto.BOOL, []),
-        helper.make_tensor_value_info("count", TensorProto.INT64, []),
-    ]
-    results = [
-        helper.make_tensor_value_info("still", TensorProto.BOOL, []),
-        helper.make_tensor_value_info("next", TensorProto.INT64, []),
-    ]
+    turn, count, following = (
+        helper.make_tensor_value_info(name, TensorProto.INT64, []) for name in ("turn", "count", "next")
+    )
+    on, still = (helper.make_tensor_value_info(name, TensorProto.BOOL, []) for name in ("on", "still"))
     steps = [helper.make_node("Identity", ["on"], ["still"]), helper.make_node("Mul", ["count", "turn"], ["next"])]
-    body = helper.make_graph(steps, "body", value_infos, results)
+    body = helper.make_graph(steps, "body", [turn, on, count], [still, following])
     *nodes, last = model.graph.node
     loop = [
         helper.make_node("ReduceSum", ["flat", "columns"], ["sums"], keepdims=0),
@@ -99,20 +90,17 @@ def endless_mlp(seed: int = 0) -> bytes:
 def counting() -> bytes:
     """A recurrent graph: `state_out_0` is the sum of all observations; the action is whether it exceeds 2."""
     nodes = [
+        helper.make_node("Mul", ["observation", "zero"], ["zeros"]),
+        helper.make_node("Add", ["zeros", "limit"], ["two"]),
         helper.make_node("Add", ["observation", "state_in_0"], ["state_out_0"]),
         helper.make_node("Concat", ["two", "state_out_0"], ["action_dist_inputs"], axis=1),
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]
-    nodes.insert(0, helper.make_node("Mul", ["observation", "zero"], ["zeros"]))
-    nodes.insert(1, helper.make_node("Add", ["zeros", "limit"], ["two"]))
-    inputs = [
-        helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", 1]),
-        helper.make_tensor_value_info("state_in_0", TensorProto.FLOAT, ["batch", 1]),
-    ]
+    inputs = [tensor("observation", "float32", 1), tensor("state_in_0", "float32", 1)]
     outputs = [
-        helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
-        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
-        helper.make_tensor_value_info("state_out_0", TensorProto.FLOAT, ["batch", 1]),
+        tensor("action", "int64"),
+        tensor("action_dist_inputs", "float32", 2),
+        tensor("state_out_0", "float32", 1),
     ]
     return serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
 
@@ -125,11 +113,8 @@ def memoryless() -> bytes:
         helper.make_node("Concat", ["two", "observation"], ["action_dist_inputs"], axis=1),
         helper.make_node("ArgMax", ["action_dist_inputs"], ["action"], axis=1, keepdims=0),
     ]
-    inputs = [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", 1])]
-    outputs = [
-        helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
-        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 2]),
-    ]
+    inputs = [tensor("observation", "float32", 1)]
+    outputs = [tensor("action", "int64"), tensor("action_dist_inputs", "float32", 2)]
     return serialized(nodes, inputs, outputs, {"zero": np.float32(0), "limit": np.float32(2)})
 
 
@@ -139,18 +124,14 @@ def continuous() -> bytes:
         helper.make_node("Identity", ["observation"], ["action"]),
         helper.make_node("Concat", ["observation", "observation"], ["action_dist_inputs"], axis=1),
     ]
-    inputs = [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["batch", 2])]
-    outputs = [
-        helper.make_tensor_value_info("action", TensorProto.FLOAT, ["batch", 2]),
-        helper.make_tensor_value_info("action_dist_inputs", TensorProto.FLOAT, ["batch", 4]),
-    ]
-    return serialized(nodes, inputs, outputs, {})
+    outputs = [tensor("action", "float32", 2), tensor("action_dist_inputs", "float32", 4)]
+    return serialized(nodes, [tensor("observation", "float32", 2)], outputs, {})
 
 
 def serialized(
     nodes: list[onnx.NodeProto],
-    inputs: list[onnx.ValueInfoProto],
-    outputs: list[onnx.ValueInfoProto],
+    inputs: list[ValueInfoProto],
+    outputs: list[ValueInfoProto],
     constants: Mapping[str, np.ndarray | np.generic],
 ) -> bytes:
     """A graph in the format of exported ones."""

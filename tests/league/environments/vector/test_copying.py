@@ -20,6 +20,7 @@ from league.environments.vector.vector_env import AgentRows
 from league.errors import ObservationError
 from league.spaces import Discrete
 from league.spaces.conversion import from_gymnasium
+from tests.support.environments.vector_copies import Chance
 
 
 def twins(config: EnvironmentConfig) -> Twins:
@@ -43,7 +44,7 @@ def test_board_games_are_restored_from_observations() -> None:
 
 
 def test_what_is_not_a_position_is_refused(subtests: pytest.Subtests) -> None:
-    for game, own, other in (
+    for game, pieces, other in (
         (TicTacToe, [0, 1], [2]),  # the other player must move
         (TicTacToe, [0], [1, 2, 3]),
         (TicTacToe, [0], [0]),
@@ -54,8 +55,8 @@ def test_what_is_not_a_position_is_refused(subtests: pytest.Subtests) -> None:
         (ConnectFour, [28, 29, 30], [35, 36, 37, 38]),
     ):
         message = r"observation 0 is not a position .*: \d own pieces and \d of"
-        with subtests.test(own=own, other=other), pytest.raises(ObservationError, match=message):
-            game(1).restore(np.array([0]), {"observation": board(game, own, other)})
+        with subtests.test(pieces=pieces, other=other), pytest.raises(ObservationError, match=message):
+            game(1).restore(np.array([0]), {"observation": board(game, pieces, other)})
 
 
 class Faulty(TicTacToe):
@@ -84,20 +85,6 @@ class Faulty(TicTacToe):
 def test_each_part_of_the_state_is_compared(attribute: str, check: Callable[[Twins], None], other: str) -> None:
     with pytest.raises(EnvironmentsDiffer, match=rf"(copy|row) .* in {other}"):
         check(Twins(lambda copies: Faulty(copies, attribute), [Discrete(n=9)] * 2))
-
-
-class Chance(TicTacToe):
-    """The seed decides which player's win counts after the fourth move."""
-
-    def reset(self, env_ids: NDArray[np.int64], seeds: NDArray[np.int64]) -> Sequence[AgentRows]:
-        self._seeds = getattr(self, "_seeds", np.zeros(self.num_envs, dtype=np.int64))
-        self._seeds[env_ids] = seeds
-        return super().reset(env_ids, seeds)
-
-    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
-        (rows,) = super().step(env_ids, actions)
-        rows.rewards[:] *= np.where(self._seeds[rows.envs] % 2 == 0, 1, -1)
-        return (rows,)
 
 
 def test_games_of_chance_are_recognised() -> None:

@@ -35,12 +35,12 @@ ENVIRONMENTS = {
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_an_equal_environment_has_no_difference(name: str) -> None:
-    found = compare(ENVIRONMENTS[name], Looped(ENVIRONMENTS[name], 3), steps=150, seed=0)
-    assert found.difference is None
-    assert 150 <= found.steps < 153
-    assert found.episodes > 5
-    assert found.vector_rate > 0
-    assert found.stock_rate > 0
+    comparison = compare(ENVIRONMENTS[name], Looped(ENVIRONMENTS[name], 3), steps=150, seed=0)
+    assert comparison.difference is None
+    assert 150 <= comparison.steps < 153
+    assert comparison.episodes > 5
+    assert comparison.vector_rate > 0
+    assert comparison.stock_rate > 0
 
 
 class Altered(Looped):
@@ -108,10 +108,10 @@ def test_each_column_is_compared(subtests: pytest.Subtests) -> None:
 
 
 def test_missing_and_exchanged_rows_are_found() -> None:
-    def every(rows: AgentRows, chosen: NDArray) -> AgentRows:
-        observations = {name: array[chosen] for name, array in rows.observations.items()}
-        others = (getattr(rows, name)[chosen] for name in ("rewards", "terminations", "truncations"))
-        return AgentRows(rows.envs[chosen], rows.agents[chosen], observations, *others)
+    def every(rows: AgentRows, indices: NDArray) -> AgentRows:
+        observations = {name: array[indices] for name, array in rows.observations.items()}
+        columns = (getattr(rows, name)[indices] for name in ("rewards", "terminations", "truncations"))
+        return AgentRows(rows.envs[indices], rows.agents[indices], observations, *columns)
 
     assert "row 1 is missing" in difference(lambda rows, call: every(rows, np.arange(min(len(rows.envs), 1))))
     backwards = difference(lambda rows, call: every(rows, np.arange(len(rows.envs))[::-1]))
@@ -141,8 +141,8 @@ class LendsActions(Looped):
 
 def test_the_caller_may_reuse_its_actions() -> None:
     stock = config("pettingzoo.classic.rps_v2")
-    found = compare(stock, LendsActions(stock, 2), 50, seed=0)
-    assert "observation is 0, in the stock environment" in (found.difference or "")
+    comparison = compare(stock, LendsActions(stock, 2), 50, seed=0)
+    assert "observation is 0, in the stock environment" in (comparison.difference or "")
 
 
 class OtherState(Looped):

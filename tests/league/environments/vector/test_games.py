@@ -1,7 +1,8 @@
 """Games of two players: all reports equal those of the stock environment, and the rules."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,14 @@ from hypothesis import strategies as st
 
 from league.config.environment import EnvironmentConfig
 from league.environments.vector.connect_four import COLUMNS, ROWS, STRIDE, ConnectFour, has_four
-from league.environments.vector.equality import compare
+from league.environments.vector.equality import DifferentialTest, compare
+from league.environments.vector.leduc.deals import deal, fast_deal
+from league.environments.vector.leduc.rules import CALL, RAISE
 from league.environments.vector.leduc_holdem import LeducHoldem
 from league.environments.vector.rps import RockPaperScissors
-from league.environments.vector.tictactoe import LINES, TicTacToe
-from league.environments.vector.vector_env import AgentRows, UnsupportedArguments
+from league.environments.vector.tictactoe import TicTacToe
+from league.environments.vector.vector_env import UnsupportedArguments
+from league.spaces import ACTION_MASK
 from tests.support.environments.plans import Plan, assert_equal, last_rows, plans
 
 CELLS = list(itertools.product(range(COLUMNS), range(ROWS)))
@@ -49,24 +53,13 @@ def test_each_of_the_69_lines_is_a_four_and_no_part_of_it() -> None:
 def test_no_other_four_cells_are_a_four() -> None:
     """Neither across the top of a column and the bottom of the next one, nor across the sides."""
     bits = [board({cell}) for cell in CELLS]
-    found = has_four(np.array([sum(cells) for cells in itertools.combinations(bits, 4)], dtype=np.uint64))
-    assert found.sum() == 69
+    are_fours = has_four(np.array([sum(cells) for cells in itertools.combinations(bits, 4)], dtype=np.uint64))
+    assert are_fours.sum() == 69
 
 
 @given(st.sets(st.sampled_from(CELLS)))
 def test_boards_have_a_four_if_they_contain_a_line(cells: set[tuple[int, int]]) -> None:
     assert four(board(cells)) == [any(set(line) <= cells for line in FOURS)]
-
-
-def moves_to(line: tuple[int, ...], player: int, last: int) -> list[int]:
-    """Cells of a game in which `player` completes `line`, with the cell `line[last]` as its last move."""
-    own = [*(cell for cell in line if cell != line[last]), line[last]]
-    others = [cell for cell in range(9) if cell not in line]
-    # Three cells of the other player that are no line themselves.
-    other = next(list(chosen) for chosen in itertools.permutations(others, 3) if tuple(sorted(chosen)) not in LINES)
-    pairs = zip(own, other, strict=True) if player == 0 else zip(other, own, strict=True)
-    moves = [cell for pair in pairs for cell in pair]
-    return moves[:5] if player == 0 else moves
 
 
 STOCK = {
@@ -90,7 +83,7 @@ def config(game: Any, **kwargs: Any) -> EnvironmentConfig:
 
 
 @pytest.mark.parametrize("game", GAMES)
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(plan=plans, arguments=RPS_ARGUMENTS)
 def test_all_reports_equal_those_of_the_stock_environment(game: Any, plan: Plan, arguments: dict[str, int]) -> None:
     kwargs = arguments if game is RockPaperScissors else {}
@@ -126,58 +119,71 @@ def test_other_arguments_are_left_to_the_stock_environment() -> None:
             game(1, **{name: value})
 
 
-def played(game: Any, actions: Iterable[int]) -> AgentRows:
-    return last_rows(config(game), game(1), list(actions))
-
-
-def assert_won(rows: AgentRows, winner: int) -> None:
-    assert rows.agents.tolist() == [1 - winner, winner], "the loser's row is the first"
-    assert rows.rewards.tolist() == [-1, 1]
-    assert rows.terminations.all()
-    assert not rows.truncations.any()
-
-
-def test_wins_are_rewarded(subtests: pytest.Subtests) -> None:
-    for columns, winner in (
-        ("0101010", 0),  # vertical, left edge
-        ("6060606", 0),  # vertical, right edge
-        ("50606060", 1),  # vertical, second player
-        ("0011223", 0),  # horizontal, bottom left
-        ("3344556", 0),  # horizontal, bottom right
-        ("01122323363", 0),  # diagonal, upwards from the corner
-        ("65544343303", 0),  # diagonal, downwards to the corner
-        ("460265125234114035562430131501302624304665", 1),  # by the last move
+def test_the_last_square_wins_or_draws(subtests: pytest.Subtests) -> None:
+    for game, moves, rewards in (
+        (ConnectFour, "460265125234114035562430131501302624304665", [-1, 1]),
+        (ConnectFour, "545062455041104565311226266362030334314210", [0, 0]),
+        (TicTacToe, "012345768", [-1, 1]),
+        (TicTacToe, "012435768", [0, 0]),
     ):
-        with subtests.test(columns=columns):
-            assert_won(played(ConnectFour, map(int, columns)), winner)
+        with subtests.test(moves=moves):
+            rows = last_rows(config(game), game(1), list(map(int, moves)))
+            assert rows.rewards.tolist() == rewards
+            assert rows.terminations.all()
+            assert not rows.observations["action_mask"].any()
 
 
-def test_each_line_of_tic_tac_toe_wins_whichever_cell_is_last() -> None:
-    for line, player, last in itertools.product(LINES, range(2), range(3)):
-        assert_won(played(TicTacToe, moves_to(line, player, last)), player)
-    assert_won(played(TicTacToe, [0, 1, 2, 3, 4, 5, 7, 6, 8]), 0)
+leduc_deals = np.transpose(deal(np.arange(2000)))
 
 
-def test_a_full_board_without_a_line_is_a_draw() -> None:
-    four = played(ConnectFour, map(int, "545062455041104565311226266362030334314210"))
-    assert four.observations["observation"].sum(axis=(1, 2, 3)).tolist() == [42, 42]
-    for rows, agents in ((four, [0, 1]), (played(TicTacToe, [0, 1, 2, 4, 3, 5, 7, 6, 8]), [1, 0])):
-        assert rows.agents.tolist() == agents
-        assert rows.rewards.tolist() == [0, 0]
-        assert rows.terminations.all()
-        assert not rows.observations["action_mask"].any()
+def legal_actions_after(actions: tuple[int, ...]) -> list[int]:
+    """In a hand with the seed 0."""
+    env, copy = LeducHoldem(1), np.array([0])
+    (rows,) = env.reset(copy, copy)
+    for action in actions:
+        (rows,) = env.step(copy, np.array([action]))
+    return np.flatnonzero(rows.observations[ACTION_MASK][0]).tolist()
 
 
-def test_rock_paper_scissors() -> None:
-    env, copies = RockPaperScissors(9, max_cycles=3), np.arange(9)
-    env.reset(copies, copies)
-    actions = np.array(list(itertools.product(range(3), repeat=2)))
-    for is_last in (False, False, True):
-        (rows,) = env.step(copies, actions.ravel())
-        # Rock (0) loses to paper (1), paper to scissors (2), scissors to rock.
-        assert rows.rewards[::2].tolist() == [0, -1, 1, 1, 0, -1, -1, 1, 0]
-        assert (rows.rewards[1::2] == -rows.rewards[::2]).all()
-        assert not np.signbit(rows.rewards[rows.rewards == 0]).any()
-        assert rows.observations["observation"].tolist() == actions[:, ::-1].ravel().tolist()
-        assert (rows.truncations == is_last).all()
-        assert not rows.terminations.any()
+def lines(actions: tuple[int, ...] = ()) -> Iterator[tuple[int, ...]]:
+    """All sequences of actions in a hand that begin with `actions`."""
+    legal = legal_actions_after(actions)
+    for action in legal:
+        yield from lines((*actions, action))
+    if not legal:
+        yield actions
+
+
+def seed_of(small_blind: int, first: int, second: int, public: int) -> int:
+    """Return a seed with this deal."""
+    return int(np.flatnonzero((leduc_deals == (small_blind, first, second, public)).all(axis=1))[0])
+
+
+def test_all_lines_of_leduc_holdem_with_all_deals() -> None:
+    cards = [cards for cards in itertools.product(range(3), repeat=3) if len(set(cards)) > 1]
+    seeds = np.array([seed_of(number % 2, *dealt) for number, dealt in enumerate(cards)])
+    copies = np.arange(len(seeds))
+    test = DifferentialTest(config(LeducHoldem), LeducHoldem(len(seeds)))
+    every = list(lines())
+    assert len(every) == 6 + 5 * 11, "6 folds in the first round, or one of 5 ways to the second with its 11"
+    for actions in every:
+        test.reset(copies, seeds)
+        for action in actions:
+            test.step(copies, np.full(len(seeds), action))
+        assert test.is_over.all()
+    test.finish()
+
+
+def test_a_hand_with_a_fast_seed_is_the_stock_hand_with_its_deal() -> None:
+    copies, seeds = np.arange(100), 2**31 - 1 - np.arange(100)
+    fast, stock = LeducHoldem(100), LeducHoldem(100)
+    fast.use_fast_seeds()
+    reports = [
+        fast.reset(copies, seeds),
+        stock.reset(copies, np.array([seed_of(*hand) for hand in zip(*fast_deal(seeds), strict=True)])),
+    ]
+    for action in (RAISE, RAISE, CALL, RAISE, RAISE, CALL):
+        for (of_fast,), (of_stock,) in [reports]:
+            np.testing.assert_equal(asdict(of_fast), asdict(of_stock))
+        reports = [env.step(copies, np.full(100, action)) for env in (fast, stock)]
+    np.testing.assert_array_equal(reports[0][0].rewards, reports[1][0].rewards)

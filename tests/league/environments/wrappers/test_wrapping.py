@@ -3,6 +3,7 @@ SuperSuit's.
 """
 
 from importlib import import_module
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,11 @@ from league.environments.wrappers.transforms import Resize
 from league.environments.wrappers.wrapping import BatchedWrappers
 from league.errors import ConfigError
 from tests.conformance.stepping import assert_same_episode, lockstep
-from tests.support.environments.wrapped import assert_same_episodes, with_supersuit
 
 HERE = __name__
 WALKER, SPREAD = "pettingzoo.sisl.multiwalker_v9", "mpe2.simple_spread_v3"
 ADVERSARY, PURSUIT = "mpe2.simple_adversary_v3", "pettingzoo.sisl.pursuit_v5"
+WORLD_COMM = "mpe2.simple_world_comm_v3"
 PISTONBALL, PONG = "pettingzoo.butterfly.pistonball_v6", "pettingzoo.butterfly.cooperative_pong_v6"
 WRAPPERS: dict[str, tuple[str, dict[str, Any]]] = {
     "action_lambda_v1": (SPREAD, {"change_action_fn": f"{HERE}:same", "change_space_fn": f"{HERE}:same"}),
@@ -82,6 +83,9 @@ CASES: list[tuple[str, dict[str, Any], list[Any]]] = [
     (PISTONBALL, SMALL, [BLUE, SIZE, {"agent_indicator_v0": {"type_only": True}}, {"dtype_v0": {"dtype": "int32"}}]),
     (PISTONBALL, SMALL, [FLOAT, SIZE, {"normalize_obs_v0": {"env_min": -1, "env_max": 3}}]),
     (PONG, {"max_cycles": 20, "render_mode": "rgb_array"}, [{"color_reduction_v0": {"mode": "G"}}, SIZE, STACK]),
+    (SPREAD, {}, []),
+    (ADVERSARY, {"continuous_actions": True}, []),
+    (WORLD_COMM, {}, ["pad_observations_v0", "agent_indicator_v0"]),
     (SPREAD, {}, ["agent_indicator_v0", STACK]),
     (SPREAD, {}, ["pad_observations_v0", "agent_indicator_v0"]),
     (SPREAD, {}, [STACK, {"reshape_v0": {"shape": [4, 18]}}, {"dtype_v0": {"dtype": "float64"}}]),
@@ -99,8 +103,10 @@ def test_resizing_equals_tinyscalers(data: st.DataObject) -> None:
     channels = data.draw(st.sampled_from([1, 3, 4]))
     images = data.draw(arrays.arrays(np.uint8, (2, height, width, channels)))
     resized = Resize(height, width, to_height, to_width)(images, np.arange(2))
-    for image, mine in zip(images, resized, strict=True):
-        np.testing.assert_array_equal(mine, tinyscaler.scale(src=image, size=(to_width, to_height), mode="bilinear"))
+    for image, image_resized in zip(images, resized, strict=True):
+        np.testing.assert_array_equal(
+            image_resized, tinyscaler.scale(src=image, size=(to_width, to_height), mode="bilinear")
+        )
 
 
 def same(value: Any, _space: Any = None) -> Any:
@@ -124,8 +130,7 @@ def test_the_wrappers_are_those_of_supersuit() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-@pytest.mark.parametrize("api", ["aec", "parallel"])
-@pytest.mark.parametrize("name", WRAPPERS)
+@pytest.mark.parametrize(("name", "api"), zip(WRAPPERS, cycle(["aec", "parallel"])))
 def test_each_wrapper_steps_in_lockstep_and_follows_the_seed(name: str, api: Any) -> None:
     entry_point, arguments = WRAPPERS[name]
     kwargs = {"n_pistons": 3} if entry_point == PISTONBALL else {}
@@ -164,12 +169,46 @@ def test_invalid_wrappers_are_rejected_with_name_position_and_reason(subtests: p
         build(config("policy_league.examples.traffic:crossing", "flatten_v0"))
 
 
+def with_supersuit(env: Any, wrappers: list[Any]) -> Any:
+    for wrapper in wrappers:
+        name, arguments = (wrapper, {}) if isinstance(wrapper, str) else next(iter(wrapper.items()))
+        values = {key: tuple(value) if isinstance(value, list) else value for key, value in arguments.items()}
+        env = getattr(supersuit, name)(env, **values)
+    return env
+
+
+def assert_same_episodes(ours: Any, theirs: Any) -> None:
+    """Two Parallel environments have the same spaces, and report the same in two episodes."""
+    for agent in theirs.possible_agents:
+        assert ours.observation_space(agent) == theirs.observation_space(agent)
+        theirs.action_space(agent).seed(5)
+    for seed in range(2):
+        actual, _ = ours.reset(seed=seed)
+        expected, _ = theirs.reset(seed=seed)
+        returned: list[tuple[np.ndarray, np.ndarray]] = []
+        while True:
+            assert list(actual) == list(expected)
+            for agent, observation in expected.items():
+                assert actual[agent].dtype == observation.dtype
+                np.testing.assert_array_equal(actual[agent], observation)
+                returned.append((actual[agent], observation.copy()))
+            if not theirs.agents:
+                break
+            actions = {agent: theirs.action_space(agent).sample() for agent in theirs.agents}
+            actual, *reports, _ = ours.step(dict(actions))
+            expected, *due, _ = theirs.step(dict(actions))
+            assert [dict(report) for report in reports] == [dict(report) for report in due]
+            assert ours.agents == theirs.agents
+        for array, at_its_time in returned[:40]:
+            np.testing.assert_array_equal(array, at_its_time, err_msg="returned arrays must not be modified later")
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_episodes_equal_supersuits(case: tuple[str, dict[str, Any], list[Any]]) -> None:
     entry_point, kwargs, wrappers = case
     ours = build(EnvironmentConfig(entry_point=entry_point, kwargs=kwargs, wrappers=wrappers))
-    assert isinstance(ours, BatchedWrappers) or not wrappers
+    assert isinstance(ours, BatchedWrappers) == (bool(wrappers) and entry_point != WORLD_COMM)
     assert_same_episodes(ours, with_supersuit(import_module(entry_point).parallel_env(**kwargs), wrappers))
 
 

@@ -1,19 +1,23 @@
-"""Batched minimax, compared with a plain recursion and with the exact solver."""
+"""Batched minimax, compared with a plain recursion and with the exact solver, and that one with OpenSpiel's search."""
 
 import sys
+from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
+import pyspiel
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from open_spiel.python.algorithms.minimax import alpha_beta_search
 
 from league.errors import ConfigError, ObservationError
-from league.policies.line_games.game import CONNECT_FOUR, TIC_TAC_TOE
+from league.policies.line_games.game import CONNECT_FOUR, TIC_TAC_TOE, LineGame
 from league.policies.line_games.minimax import LOST, BatchedMinimax
-from league.policies.line_games.solver import LineGameSolver
+from league.policies.line_games.solver import MAX_EMPTY, LineGameSolver
 from league.policies.scripted import script
-from tests.support.environments.line_games import environment_after, observations, random_moves, spaces
+from tests.support.environments.line_games import environment_after, legal, observations, random_moves, spaces
 
 GAMES = {"connect_four": CONNECT_FOUR, "tictactoe": TIC_TAC_TOE}
 
@@ -41,13 +45,13 @@ def expected(solver: LineGameSolver, own: int, other: int, plies: int) -> dict[i
 def test_values_equal_those_of_a_plain_recursion(name: str, seed: int, plies_played: int, plies: int) -> None:
     env = environment_after(name, random_moves(name, seed, plies_played))
     search, solver = BatchedMinimax(GAMES[name]), LineGameSolver(GAMES[name])
-    own, other = search.positions(observations([env] * 2)["observation"])
-    assert [int(own[0]), int(other[0])] == list(solver.position(observations([env])["observation"][0]))
-    found = search.values(own, other, plies)
-    wanted = np.full(GAMES[name].actions, LOST)
-    for action, value in expected(solver, int(own[0]), int(other[0]), plies).items():
-        wanted[action] = value
-    assert found.tolist() == [wanted.tolist()] * 2
+    board, opponent_board = search.positions(observations([env] * 2)["observation"])
+    assert [int(board[0]), int(opponent_board[0])] == list(solver.position(observations([env])["observation"][0]))
+    values_found = search.values(board, opponent_board, plies)
+    values_expected = np.full(GAMES[name].actions, LOST)
+    for action, value in expected(solver, int(board[0]), int(opponent_board[0]), plies).items():
+        values_expected[action] = value
+    assert values_found.tolist() == [values_expected.tolist()] * 2
 
 
 @settings(max_examples=20, deadline=None)
@@ -55,9 +59,9 @@ def test_values_equal_those_of_a_plain_recursion(name: str, seed: int, plies_pla
 def test_a_search_to_the_end_of_tic_tac_toe_is_exact(seed: int) -> None:
     env = environment_after("tictactoe", random_moves("tictactoe", seed, 4))
     search, solver = BatchedMinimax(TIC_TAC_TOE), LineGameSolver(TIC_TAC_TOE)
-    own, other = search.positions(observations([env])["observation"])
-    signs = np.sign(search.values(own, other, 9)[0])
-    outcomes = solver.outcomes(int(own[0]), int(other[0]))
+    board, opponent_board = search.positions(observations([env])["observation"])
+    signs = np.sign(search.values(board, opponent_board, 9)[0])
+    outcomes = solver.outcomes(int(board[0]), int(opponent_board[0]))
     assert {action: int(signs[action]) for action in outcomes} == outcomes
 
 
@@ -118,3 +122,60 @@ def test_faults_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyspiel", None)
     with pytest.raises(ConfigError, match=r"script:mcts_100 needs OpenSpiel: pip install 'policy-league\[openspiel\]'"):
         script("mcts_100", *spaces(env))
+
+
+def outcomes(game: LineGame, env: Any) -> dict[int, int]:
+    solver = LineGameSolver(game)
+    return solver.outcomes(*solver.position(observations([env])["observation"][0]))
+
+
+def expected_outcomes(name: str, moves: Sequence[int]) -> dict[int, int]:
+    rules = pyspiel.load_game(name)
+    state = rules.new_initial_state()
+    for move in moves:
+        state.apply_action(move)
+    player = state.current_player()
+    return {
+        action: int(alpha_beta_search(rules, state.child(action), maximizing_player_id=player)[0])
+        for action in state.legal_actions()
+    }
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 8) | st.just(0))
+def test_outcomes_of_tic_tac_toe_equal_those_of_minimax(seed: int, plies: int) -> None:
+    moves = random_moves("tictactoe", seed, plies)
+    assert outcomes(TIC_TAC_TOE, environment_after("tictactoe", moves)) == expected_outcomes("tic_tac_toe", moves)
+
+
+def test_it_plays_each_of_the_best_actions() -> None:
+    """After a corner, only the centre draws in tic-tac-toe; the answer to the centre is any corner."""
+    for moves, best in (([0], {4}), ([4], {0, 2, 6, 8})):
+        env = environment_after("tictactoe", moves)
+        rng = [np.random.default_rng(seed) for seed in range(80)]
+        assert set(script("solver", *spaces(env)).act(observations([env] * 80), rng=rng).actions.tolist()) == best
+
+
+@pytest.mark.parametrize("seed", [28, 40, 59, 102, 173, 176, 224])
+def test_late_outcomes_of_connect_four_equal_those_of_minimax(seed: int) -> None:
+    """The random games of these seeds have more than 36 plies."""
+    for plies in (32, 34, 36):
+        moves = random_moves("connect_four", seed, plies)
+        assert len(moves) == plies
+        env = environment_after("connect_four", moves)
+        assert outcomes(CONNECT_FOUR, env) == expected_outcomes("connect_four", moves)
+
+
+def test_early_positions_of_connect_four_are_played_like_one_ply() -> None:
+    for plies in (0, 41 - MAX_EMPTY):
+        seed = next(seed for seed in range(1000) if len(random_moves("connect_four", seed, plies)) == plies)
+        env = environment_after("connect_four", random_moves("connect_four", seed, plies))
+        assert len(legal(env)) > 1
+        batch = observations([env] * 50)
+        first, second = (
+            script(name, *spaces(env))
+            .act(batch, rng=[np.random.default_rng(row) for row in range(50)])
+            .actions.tolist()
+            for name in ("solver", "one_ply")
+        )
+        assert first == second

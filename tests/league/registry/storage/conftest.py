@@ -1,13 +1,20 @@
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from uuid import uuid4
 
 import pytest
 
 from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.leagues.registries import registered
-from tests.support.servers import object_store
+from tests.support.servers import object_store, postgresql
+
+
+@pytest.fixture
+def postgresql_storage(tmp_path: Path, postgresql_socket: Path) -> Storage:
+    url = postgresql.create(postgresql_socket, f"league_{uuid4().hex}")
+    return replace(Storage.at(tmp_path / "home"), database_url=url)
 
 
 @dataclass(frozen=True)

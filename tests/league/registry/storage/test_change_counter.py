@@ -1,26 +1,29 @@
-"""Changes that replicas follow are counted, in the order of their commits."""
+"""Changes that replicas follow are counted, in the order of their commits. A repeated call is applied once."""
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import pytest
+from sqlalchemy import update
 
 from league.config.league import LeagueConfig
-from league.errors import StorageError
+from league.errors import AliasMoved, KeyReused, StorageError
 from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage import change_counter
 from league.registry.storage.database import before
-from league.registry.storage.rows import ChangeCounts, Portion
+from league.registry.storage.idempotency import KEPT, IdempotentCall
+from league.registry.storage.rows import AliasEvent, ChangeCounts, Portion
+from league.registry.storage.tables import IdempotentCallTable
 from tests.support.databases import on_both_databases
-from tests.support.leagues.registries import LEAGUE, config, interface, registered
+from tests.support.leagues.registries import LEAGUE, config, interface, promote, publish, registered
 
 pytestmark = on_both_databases
-
-
-def promote(registry: Registry, version: int, league: str = LEAGUE) -> None:
-    registry.aliases.set(league, "champion", version, expected=ANY, actor="test", reason="test")
 
 
 def register(registry: Registry, play: dict[str, object]) -> None:
@@ -72,3 +75,66 @@ def test_changes_of_different_leagues_are_committed_one_after_the_other(two_vers
             promote(two_versions, 1, "another")
     promote(two_versions, 1, "another")
     assert two_versions.changes.counts() == ChangeCounts(2, 0, 0, 2)
+
+
+@pytest.fixture
+def call(registry: Registry) -> IdempotentCall:
+    """A call on a league whose champion was version 1, then 2, then 3."""
+    for number in (1, 2, 3):
+        publish(registry, f"run/{number}")
+        registry.aliases.set(LEAGUE, "champion", number, expected=ANY, actor="test", reason="test")
+    key, _ = registry.keys.create("bot", ["promote"])
+    return IdempotentCall(owner=key.id, key="first", digest="0" * 64)
+
+
+def roll_back(registry: Registry, call: IdempotentCall) -> AliasEvent:
+    return registry.aliases.rollback(LEAGUE, actor="bot", reason="test", call=call)
+
+
+def test_a_failed_call_can_be_retried(registry: Registry, call: IdempotentCall) -> None:
+    def move() -> AliasEvent:
+        return registry.aliases.set(LEAGUE, "champion", 1, expected=2, actor="bot", reason="test", call=call)
+
+    with pytest.raises(AliasMoved):
+        move()
+    registry.aliases.rollback(LEAGUE, actor="test", reason="test")
+    assert move().version == 1
+
+
+def test_concurrent_calls_are_applied_once(registry: Registry, call: IdempotentCall) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        events = list(pool.map(lambda _: roll_back(registry, call), range(8)))
+    assert len({event.id for event in events}) == 1
+    assert registry.aliases.current(LEAGUE) == {"champion": 2}
+
+
+def test_a_repeated_call_gets_the_same_answer_for_a_day(registry: Registry, call: IdempotentCall) -> None:
+    first = roll_back(registry, call)
+    assert roll_back(registry, call) == first
+    with pytest.raises(KeyReused, match="'first' was used for another call"):
+        roll_back(registry, replace(call, digest="1" * 64))
+    assert registry.aliases.current(LEAGUE) == {"champion": 2}
+    other, _ = registry.keys.create("other", ["promote"])
+    assert roll_back(registry, replace(call, owner=other.id)).version == 1, "keys are separate for each owner"
+    assert roll_back(registry, call) == first, "even after other changes"
+    registry.aliases.set(LEAGUE, "champion", 3, expected=1, actor="test", reason="test")
+    assert roll_back(registry, replace(call, key="second")).version == 1
+    registry.aliases.set(LEAGUE, "champion", 3, expected=1, actor="test", reason="test")
+    with registry.database.write() as session:
+        session.execute(update(IdempotentCallTable).values(at=datetime.now(UTC) - KEPT - timedelta(minutes=1)))
+    assert roll_back(registry, call).version == 1
+
+
+def test_each_kind_of_call_can_be_repeated(registry: Registry, call: IdempotentCall) -> None:
+    calls: dict[str, Callable[[IdempotentCall], Any]] = {
+        "a canary": lambda call: registry.traffic.set(
+            LEAGUE, canary=Portion(2, 0.1), actor="bot", reason="test", call=call
+        ),
+        "an evaluation": lambda call: registry.evaluations.submit(LEAGUE, {}, actor="bot", max_active=8, call=call),
+    }
+    for name, apply in calls.items():
+        first = apply(replace(call, key=name))
+        assert apply(replace(call, key=name)) == first
+        with pytest.raises(KeyReused):
+            apply(replace(call, key=name, digest="1" * 64))
+    assert len(registry.evaluations.newest(LEAGUE)) == 1

@@ -1,20 +1,22 @@
-"""An SQLite file that is moved, restored or replaced while it is in use, and the timeouts of PostgreSQL."""
+"""An SQLite file that is moved, restored or replaced while it is in use, the timeouts of PostgreSQL, and records."""
 
 import shutil
 from contextlib import nullcontext
+from dataclasses import FrozenInstanceError, fields, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from uuid import uuid4
 
 import psycopg
 import pytest
-from sqlalchemy import event, text
+from sqlalchemy import event, inspect, text
+from sqlalchemy.orm.exc import DetachedInstanceError
 
 from league.errors import ConfigError, StorageError
 from league.registry.registry import Registry
 from league.registry.storage.database import Database
+from league.registry.storage.rows import HEARTBEAT_TIMEOUT, KeyRow, Record, RunRow
 from league.settings import Storage
-from tests.support.leagues.registries import registered
-from tests.support.servers import postgresql
+from tests.support.leagues.registries import LEAGUE, publish, registered
 from tests.support.small_disk import fill, small_disk
 
 
@@ -62,11 +64,6 @@ def test_a_reader_creates_no_database(tmp_path: Path) -> None:
     assert not (tmp_path / "home").exists()
 
 
-@pytest.fixture
-def server(postgresql_socket: Path) -> str:
-    return postgresql.create(postgresql_socket, f"database_{uuid4().hex}")
-
-
 def settings_of(url: str) -> tuple[dict[str, str], str, str]:
     """The parameters of the connection, and the timeouts of the session."""
     database = Database(url)
@@ -79,8 +76,8 @@ def settings_of(url: str) -> tuple[dict[str, str], str, str]:
     return parameters, *timeouts
 
 
-def test_a_transaction_does_not_wait_long_for_a_lock(server: str) -> None:
-    database = Database(f"{server}%20-c%20lock_timeout%3D50ms")
+def test_a_transaction_does_not_wait_long_for_a_lock(postgresql_storage: Storage) -> None:
+    database = Database(f"{postgresql_storage.database_url}%20-c%20lock_timeout%3D50ms")
     lock = text("LOCK TABLE leagues IN EXCLUSIVE MODE")
     with database.write() as first:
         first.execute(lock)
@@ -119,7 +116,8 @@ def test_a_full_disk_is_called_so(tmp_path: Path) -> None:
             Registry.open(storage)
 
 
-def test_connections_to_postgresql_have_timeouts_that_the_url_can_change(server: str) -> None:
+def test_connections_to_postgresql_have_timeouts_that_the_url_can_change(postgresql_storage: Storage) -> None:
+    server = postgresql_storage.database_url
     parameters, statement, lock = settings_of(server)
     assert (parameters["connect_timeout"], parameters["tcp_user_timeout"]) == ("3", "5000")
     assert (statement, lock) == ("30s", "10s")
@@ -144,3 +142,43 @@ def test_an_unsupported_database_is_reported_in_one_line(tmp_path: Path) -> None
     (tmp_path / "league.db").write_text("these are not the bytes of a database, however long they go on " * 100)
     with pytest.raises(StorageError, match=r"league\.db cannot be used: file is not a database"):
         Registry.open(Storage.at(tmp_path))
+
+
+@pytest.fixture
+def records(registry: Registry) -> dict[type[Record], Record]:
+    """A record that was read, and records that were created."""
+    publish(registry, "run/1000")
+    event = registry.aliases.set(LEAGUE, "champion", 1, expected=None, actor="ada", reason="test")
+    run = registry.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=1, target=9)
+    key, _ = registry.keys.create("ci", ["read"])
+    rows = [registry.leagues.get(LEAGUE), event, run, key, registry.nightly_runs.open(LEAGUE, [1], 0.1)]
+    return {type(record): record for record in rows}
+
+
+def test_records_are_immutable_after_their_transaction(records: dict[type[Record], Record], registry: Registry) -> None:
+    for record in records.values():
+        assert inspect(record).detached
+        for name in (field.name for field in fields(record)):
+            with pytest.raises(FrozenInstanceError, match=f"{name} of {type(record).__name__} cannot be set"):
+                setattr(record, name, None)
+    (key,) = registry.keys.all()
+    assert key == records[KeyRow]
+    assert key != replace(key, expires_at=datetime.now(UTC))
+    assert registry.runs.get(LEAGUE, "run") == records[RunRow]
+
+
+def test_the_record_of_a_run_is_read_only_where_it_is_needed(registry: Registry) -> None:
+    registry.runs.begin(LEAGUE, "run", algorithm="ppo", settings={}, seed=1, target=9, record={"pins": {}})
+    registry.runs.begin(LEAGUE, "other", algorithm="ppo", settings={}, seed=1, target=9)
+    with pytest.raises(DetachedInstanceError):
+        _ = registry.runs.get(LEAGUE, "run").record
+    assert [(run.id, run.record) for run in registry.runs.stored(LEAGUE)] == [("run", {"pins": {}})]
+
+
+def test_a_run_is_silent_without_heartbeats(records: dict[type[Record], Record]) -> None:
+    run = records[RunRow]
+    assert isinstance(run, RunRow)
+    silent_since = datetime.now(UTC) - 2 * HEARTBEAT_TIMEOUT
+    assert run.state == "running"
+    assert replace(run, heartbeat_at=silent_since).state == "silent"
+    assert replace(run, heartbeat_at=silent_since, reported_state="ended").state == "ended"

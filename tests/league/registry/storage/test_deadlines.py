@@ -10,11 +10,10 @@ import pytest
 from sqlalchemy import text
 
 from league.errors import DeadlineExceeded, StorageError
-from league.registry.aliases import ANY
 from league.registry.registry import Registry
-from league.registry.storage.database import Deadlock, Repository, before, repeat_after_deadlock
+from league.registry.storage.database import Database, Deadlock, Repository, before, repeat_after_deadlock
 from tests.support.databases import on_both_databases
-from tests.support.leagues.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, promote, registered
 from tests.support.waiting import until
 
 pytestmark = on_both_databases
@@ -28,10 +27,6 @@ def served(empty: Registry) -> Registry:
     return registry
 
 
-def promote(registry: Registry, version: int) -> None:
-    registry.aliases.set(LEAGUE, "champion", version, expected=ANY, actor="test", reason="test")
-
-
 @contextmanager
 def locked(registry: Registry) -> Iterator[None]:
     """Another connection holds the lock that changes of the league wait for."""
@@ -43,7 +38,7 @@ def locked(registry: Registry) -> Iterator[None]:
 
 
 def test_a_transaction_that_ends_after_its_deadline_is_rolled_back(served: Registry) -> None:
-    deadline = time.monotonic() + 0.5
+    deadline = time.monotonic() + 0.1
 
     def change() -> None:
         with served.database.write() as session:
@@ -67,7 +62,7 @@ def test_deadlines_do_not_outlast_their_block(served: Registry) -> None:
 
 
 def test_a_change_waits_for_a_lock_until_its_deadline(served: Registry) -> None:
-    with locked(served), pytest.raises((StorageError, DeadlineExceeded)), before(time.monotonic() + 0.2):
+    with locked(served), pytest.raises((StorageError, DeadlineExceeded)), before(time.monotonic() + 0.1):
         promote(served, 2)
     with before(time.monotonic()), pytest.raises(DeadlineExceeded, match="nothing was changed"):
         promote(served, 2)
@@ -97,7 +92,8 @@ class Swaps(Repository):
 def test_a_deadlock_is_resolved_by_one_repetition(served: Registry) -> None:
     if served.database.engine.dialect.name == "sqlite":
         pytest.skip("SQLite runs one write transaction at a time")
-    swaps, columns = Swaps(served.database), ["leagues SET slug = slug", "aliases SET version = version"]
+    database = Database(f"{served.storage.database_url}%20-c%20deadlock_timeout%3D50ms")
+    swaps, columns = Swaps(database), ["leagues SET slug = slug", "aliases SET version = version"]
     with ThreadPoolExecutor() as pool:
         for change in [pool.submit(swaps.update, *order, [True]) for order in (columns, columns[::-1])]:
             change.result()

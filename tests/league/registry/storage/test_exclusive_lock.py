@@ -3,26 +3,18 @@
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from uuid import uuid4
 
 import pytest
 from sqlalchemy import text
 
 from league.errors import AlreadyRunning, StorageError
-from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.databases import on_both_databases
-from tests.support.leagues.registries import LEAGUE, registered
-from tests.support.servers import postgresql
+from tests.support.leagues.registries import LEAGUE, promote, registered
 from tests.support.waiting import until
 
 HOLDERS = "SELECT pid FROM pg_locks WHERE locktype = 'advisory' AND granted"
-
-
-def promote(registry: Registry, version: int) -> None:
-    registry.aliases.set(LEAGUE, "champion", version, expected=ANY, actor="test", reason="test")
 
 
 def champion(registry: Registry) -> int | None:
@@ -96,10 +88,9 @@ def test_one_process_holds_the_lock_until_it_exits(storage: Storage) -> None:
 
 
 @pytest.fixture
-def registry(tmp_path: Path, postgresql_socket: Path) -> Registry:
-    """A registry on PostgreSQL: with SQLite, only the end of the process releases the lock."""
-    url = postgresql.create(postgresql_socket, f"lock_{uuid4().hex}")
-    return registered(Registry.open(Storage(tmp_path / "home", url, tmp_path / "artifacts")), LEAGUE, versions=3)
+def registry(postgresql_storage: Storage) -> Registry:
+    """With SQLite, only the end of the process releases the lock."""
+    return registered(Registry.open(postgresql_storage), LEAGUE, versions=3)
 
 
 def test_a_holder_that_lost_its_lock_changes_nothing(registry: Registry) -> None:

@@ -3,9 +3,7 @@
 import os
 import select
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
-from uuid import uuid4
 
 import pytest
 from sqlalchemy import text
@@ -15,20 +13,13 @@ from league.registry.registry import Registry
 from league.registry.storage.database import Database
 from league.registry.storage.listener import Listener
 from league.settings import Storage
-from tests.support.servers import postgresql
 
 SECONDS = 30
 
 
 @pytest.fixture
-def storage(tmp_path: Path, postgresql_socket: Path) -> Storage:
-    url = postgresql.create(postgresql_socket, f"listener_{uuid4().hex}")
-    return replace(Storage.at(tmp_path), database_url=url)
-
-
-@pytest.fixture
-def registry(storage: Storage) -> Iterator[Registry]:
-    registry = Registry.open(storage)
+def registry(postgresql_storage: Storage) -> Iterator[Registry]:
+    registry = Registry.open(postgresql_storage)
     yield registry
     registry.close()
 
@@ -105,17 +96,17 @@ def test_pooled_connections_are_closed_when_they_are_not_used(registry: Registry
 
 def test_discarded_notifications_are_not_seen_again(registry: Registry, listening: Database) -> None:
     listener = listener_of(listening)
-    seen = list[None]()
-    listener.on_change = lambda: seen.append(None)
+    notifications = list[None]()
+    listener.on_change = lambda: notifications.append(None)
     listener.discard()  # without a connection
     registry.keys.create("bot", ["act"])
     with listening.read() as session:
         session.execute(text("SELECT 1"))
     registry.keys.create("another", ["act"])
     assert is_readable(listener, SECONDS)
-    seen.clear()
+    notifications.clear()
     listener.discard()
     assert not is_readable(listener, 0)
     with listening.read() as session:
         session.execute(text("SELECT 1"))
-    assert seen == []
+    assert notifications == []

@@ -3,17 +3,16 @@ nights of training.
 """
 
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from itertools import pairwise
 
 import pytest
-from sqlalchemy import update
 
-from league.errors import InvalidInput, UnknownLeague, UnknownRun
+from league.errors import InvalidInput, UnknownRun
 from league.registry.registry import Registry
-from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunPoint, RunRow, StrengthRow
+from league.registry.storage.rows import RunPoint, RunRow, StrengthRow
 from league.registry.training import runs
-from tests.support.leagues.registries import LEAGUE, publish, registered
+from tests.support.leagues.registries import LEAGUE, expire_heartbeats, publish, registered
 
 SETTINGS = {"algorithm": "ppo", "lr": 3e-4}
 
@@ -31,13 +30,6 @@ def record(registry: Registry, steps: int, run: str = "first", **curves: float) 
 
 def steps_of(registry: Registry, run: str = "first") -> list[int]:
     return [point.steps for point in registry.runs.points(LEAGUE, run)]
-
-
-def expire_heartbeats(registry: Registry) -> None:
-    with registry.database.write() as session:
-        session.execute(
-            update(RunRow).values(heartbeat_at=datetime.now(UTC) - HEARTBEAT_TIMEOUT - timedelta(seconds=1))
-        )
 
 
 def test_a_run_begins_records_points_and_ends(registry: Registry) -> None:
@@ -66,13 +58,13 @@ def test_a_run_begins_records_points_and_ends(registry: Registry) -> None:
 
 def test_a_run_without_heartbeat_is_silent_until_the_next_one(registry: Registry) -> None:
     begin(registry)
-    expire_heartbeats(registry)
+    expire_heartbeats(registry, RunRow)
     assert registry.runs.get(LEAGUE, "first").state == registry.runs.newest(LEAGUE)[0].state == "silent"
     assert registry.runs.counts() == {}
     registry.runs.record(LEAGUE, "first", None)
     assert registry.runs.get(LEAGUE, "first").state == "running"
     registry.runs.end(LEAGUE, "first", "stopped")
-    expire_heartbeats(registry)
+    expire_heartbeats(registry, RunRow)
     assert registry.runs.get(LEAGUE, "first").state == "stopped", "the run has ended"
 
 
@@ -93,14 +85,11 @@ def test_a_resumed_run_drops_the_points_after_its_checkpoint(registry: Registry)
     assert registry.runs.points(LEAGUE, "first")[-1].curves == {"loss": 2.0}
 
 
-@pytest.mark.parametrize("jitter", [0, 3])
-def test_points_are_spread_evenly_over_the_run(
-    registry: Registry, jitter: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_points_are_spread_evenly_over_the_run(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runs, "MAX_POINTS", 21)
     begin(registry)
-    for number in range(150):
-        newest = 10 * number + number % 2 * jitter
+    for number in range(100):
+        newest = 10 * number + number % 2 * 3
         record(registry, newest)
         kept = steps_of(registry)
         assert len(kept) < 21
@@ -121,14 +110,10 @@ def test_runs_are_listed_newest_first(registry: Registry) -> None:
         registry.runs.newest(LEAGUE, before="run-9")
 
 
-def test_unknown_leagues_and_runs_are_reported(registry: Registry) -> None:
-    with pytest.raises(UnknownLeague, match="chess"):
-        registry.runs.begin("chess", "first", algorithm="ppo", settings={}, seed=0, target=1)
+def test_unknown_runs_are_reported(registry: Registry) -> None:
     for call in (registry.runs.get, registry.runs.points, lambda *run: registry.runs.end(*run, "ended")):
         with pytest.raises(UnknownRun, match="has no training run 'first'"):
             call(LEAGUE, "first")
-    with pytest.raises(UnknownLeague):
-        registry.runs.newest("chess")
 
 
 def test_nights_are_numbered_within_their_league(registry: Registry) -> None:
@@ -170,5 +155,3 @@ def test_scores_are_read_by_run_in_the_order_of_the_versions(registry: Registry)
     registry.strength.record([replace(other, opponent="script:one_ply")])
     assert len(registry.strength.of_run(LEAGUE, "second")) == 2
     assert registry.strength.of_run(LEAGUE, "third") == []
-    with pytest.raises(UnknownLeague, match="chess"):
-        registry.strength.of_run("chess", "first")

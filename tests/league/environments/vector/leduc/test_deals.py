@@ -4,14 +4,14 @@ from math import factorial
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rlcard.games.leducholdem import Game
 from rlcard.utils import seeding
 
 from league.environments.vector.leduc import deals
-from league.environments.vector.leduc.deals import EQUALLY_PROBABLE, Deals, Generators, deal, fast_deal, outputs
+from league.environments.vector.leduc.deals import EQUALLY_PROBABLE, Deals, Generators, deal, fast_deal
 from league.random import splitmix64
 
 RANKS = "JQK"
@@ -27,8 +27,8 @@ def rlcards_deal(seed: int) -> tuple[int, ...]:
 
 
 def test_deals_equal_rlcards() -> None:
-    drawn = np.random.default_rng(0).integers(2**31, size=4000)
-    seeds = np.concatenate([np.arange(1000), drawn, 2**31 - 1 - np.arange(10)])
+    drawn = np.random.default_rng(0).integers(2**31, size=500)
+    seeds = np.concatenate([np.arange(200), drawn, 2**31 - 1 - np.arange(10)])
     assert np.array_equal(np.transpose(deal(seeds)), [rlcards_deal(int(seed)) for seed in seeds])
 
 
@@ -54,13 +54,6 @@ def test_fast_deals_have_exactly_the_distribution_of_the_stock_deals(monkeypatch
 
 
 SEEDS = st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=5)
-
-
-@given(SEEDS, st.integers(1, 700))
-@example([0, 1, 2**31 - 1], 700)
-def test_outputs_equal_those_of_rlcards_generators(seeds: list[int], count: int) -> None:
-    expected = [seeding.np_random(seed)[0].randint(0, 2**32, size=count, dtype=np.uint32) for seed in seeds]
-    assert np.array_equal(outputs(np.array(seeds), count), expected)
 
 
 @pytest.mark.parametrize("deal_cards", [deal, fast_deal])

@@ -4,7 +4,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from mpe2._mpe_utils import core
 
-from league.environments.vector.mpe.particles import Particles, Physics, World, at_rest, lengths
+from league.environments.vector.mpe.particles import Particles, Physics, World, at_rest
 from tests.support.examples import examples
 
 SIZES = (0.15, 0.05, 0.2)
@@ -80,18 +80,6 @@ def stock_step(
     )
 
 
-def test_agents_at_the_same_place_have_no_velocity_as_in_mpe2() -> None:
-    """The direction of their repulsion is 0 / 0. Initial positions are never equal."""
-    world = World(2, 0, (0.15, 0.15), accelerations=(5.0, 5.0))
-    still = np.zeros((1, 2, 2))
-    particles = in_motion(world, still, still)
-    with np.errstate(invalid="ignore"):
-        Physics(world).step(particles, np.zeros((2, 2, 1)))
-        _, velocities = stock_step(world, still[0], still[0], still[0])
-    assert np.isnan(particles.velocities).all()
-    assert np.isnan(velocities).all()
-
-
 def test_the_repulsion_at_all_distances_equals_that_of_mpe2() -> None:
     """From a deep overlap to a distance at which the repulsion underflows."""
     world = World(2, 0, (0.1, 0.1), accelerations=(5.0, 5.0))
@@ -120,9 +108,3 @@ def test_functions_of_numpy_round_arrays_as_scalars(function: np.ufunc) -> None:
 def test_logaddexp_rounds_arrays_as_scalars() -> None:
     values = np.random.default_rng(0).uniform(-800, 300, 20_000)
     np.testing.assert_array_equal(np.logaddexp(0, values), [np.logaddexp(0, value) for value in values])
-
-
-@given(st.lists(POINTS, min_size=1, max_size=5))
-def test_lengths_equal_those_of_mpe2(vectors: list[tuple[float, float]]) -> None:
-    expected = [np.sqrt(np.sum(np.square(np.array(vector)))) for vector in vectors]
-    np.testing.assert_array_equal(lengths(np.array(vectors).T), expected)
