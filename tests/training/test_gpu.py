@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ from ray.rllib.algorithms.algorithm import Algorithm
 
 from league.config.league import LeagueConfig
 from league.environments.building import interface
+from tests.support.algorithms import running
 from training.export.publish import load_modules
-from training.runs.trial import build_algorithm
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
@@ -46,15 +45,6 @@ def ray_with_a_gpu() -> Iterator[None]:
     ray.shutdown()
 
 
-@contextmanager
-def built(league: LeagueConfig, checkpoint: Path | None = None) -> Iterator[Algorithm]:
-    algorithm = build_algorithm(league, interface(league), checkpoint)
-    try:
-        yield algorithm
-    finally:
-        algorithm.stop()
-
-
 def modules(algorithm: Algorithm) -> dict[str, dict[str, torch.Tensor]]:
     learner = algorithm.learner_group._learner
     return {policy: module.state_dict() for policy, module in learner.module.items()}
@@ -66,7 +56,7 @@ def test_the_learner_and_the_runner_use_the_gpu_and_the_cpu_continues(case: str,
     league = LeagueConfig.load(ROOT / f"policy_league/configs/{name}.yaml").with_training(
         runners=0, num_envs=8, **changes
     )
-    with built(league.with_training(gpus=0.5, runner_gpus=0.5)) as algorithm:
+    with running(league.with_training(gpus=0.5, runner_gpus=0.5)) as algorithm:
         for _ in range(3):
             learned = algorithm.train()["learners"]
         before = modules(algorithm)
@@ -76,7 +66,7 @@ def test_the_learner_and_the_runner_use_the_gpu_and_the_cpu_continues(case: str,
     assert all(math.isfinite(value) for statistics in policies for value in statistics.values())
     assert all(value.is_cuda for state in before.values() for value in state.values())
     for gpus in (0, 1):
-        with built(league.with_training(gpus=gpus), tmp_path / "checkpoint") as algorithm:
+        with running(league.with_training(gpus=gpus), tmp_path / "checkpoint") as algorithm:
             for policy, state in modules(algorithm).items():
                 for key, value in state.items():
                     assert value.is_cuda == bool(gpus)

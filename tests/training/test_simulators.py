@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,12 @@ from league.environments.building import interface
 from league.errors import ConfigError
 from league.registry.registry import Registry
 from tests.support import simulators
+from tests.support.algorithms import running
+from tests.support.leagues.training_leagues import small
 from tests.support.simulators import LEAGUE, external, pettingzoo, simulating
+from training.algorithms import off_policy
+from training.export import parity
 from training.export.publish import Checkpoint, publish
-from training.runs.trial import build_algorithm
 
 SMALL = {"hidden": [8], "runners": 0, "num_envs": 4}
 ON_POLICY = SMALL | {"train_batch_size": 64, "minibatch_size": 64, "epochs": 1}
@@ -49,15 +53,15 @@ def opened(case: tuple[LeagueConfig, Any], tmp_path: Path) -> Iterator[Registry]
 
 
 @pytest.mark.usefixtures("ray_session")
-def test_trains_publishes_and_evaluates(case: tuple[LeagueConfig, Any], opened: Registry, tmp_path: Path) -> None:
+def test_trains_publishes_and_evaluates(
+    case: tuple[LeagueConfig, Any], opened: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(off_policy, "ITERATION_STEPS", 128)
+    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, observations=256))
     league = opened.leagues.get(LEAGUE).config
-    with simulating(opened, pettingzoo(case[1])):
-        algorithm = build_algorithm(league, interface(league), storage=opened.storage)
-        try:
-            algorithm.train()
-            algorithm.save_to_path(str(tmp_path / "64"))
-        finally:
-            algorithm.stop()
+    with simulating(opened, pettingzoo(case[1])), running(league, storage=opened.storage) as algorithm:
+        algorithm.train()
+        algorithm.save_to_path(str(tmp_path / "64"))
     version = publish(
         Checkpoint(tmp_path / "64", source="run/64", steps=64),
         registry=opened,
@@ -72,14 +76,10 @@ def test_trains_publishes_and_evaluates(case: tuple[LeagueConfig, Any], opened: 
     assert {standing.ref for standing in report.leaderboard} >= {version.ref, "script:random"}
 
 
-@pytest.mark.parametrize(
-    ("training", "named"),
-    [
-        ({"curriculum": [{"kwargs": {"n": 1}, "until": {"return": 1}}, {"kwargs": {"n": 2}}]}, "training.curriculum"),
-        ({"wrappers": ["my.module:wrapper"]}, "training.wrappers"),
-    ],
-)
-def test_what_needs_a_game_in_python_is_refused(training: dict[str, Any], named: str) -> None:
-    stock = LeagueConfig.from_mapping({"league": "s", "environment": {"entry_point": "pettingzoo.classic.rps_v2"}})
-    with pytest.raises(ConfigError, match=f"{named} is for games in Python"):
-        external(stock, training=training)
+def test_what_needs_a_game_in_python_is_refused() -> None:
+    stock = small("pettingzoo.classic.rps_v2")
+    stages = [{"kwargs": {"n": 1}, "until": {"return": 1}}, {"kwargs": {"n": 2}}]
+    with pytest.raises(ConfigError, match=r"training\.curriculum is for games in Python"):
+        external(stock, training={"curriculum": stages})
+    with pytest.raises(ConfigError, match=r"training\.wrappers is for games in Python"):
+        external(stock, training={"wrappers": ["my.module:wrapper"]})

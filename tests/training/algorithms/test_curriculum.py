@@ -4,9 +4,8 @@ from typing import Any
 
 import pytest
 
-from league.config.league import LeagueConfig
 from league.errors import ConfigError
-from tests.support.leagues.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import small, tictactoe
 from training.algorithms.curriculum import STAGE, UPDATES, Curriculum
 
 
@@ -45,29 +44,22 @@ def test_without_a_curriculum_there_is_no_curve() -> None:
     assert (stages.advance({}, 10**9), stages.metrics()) == (False, {})
 
 
-@pytest.mark.parametrize(
-    ("stages", "message"),
-    [
+def test_invalid_stages_are_refused(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[list[dict[str, Any]], str]] = [
         ([{"kwargs": {}}, {}], "stage 1 never ends: expected steps or until"),
         ([{"steps": 5}], "stage 1 is the last one, which lasts until the end: remove steps and until"),
         ([{"steps": 0}, {}], "curriculum"),
         ([{"kwargs": {"n": {"choice": []}}}], r"n: expected choice: \[value, …\], got {'choice': \[\]}"),
         ([{"kwargs": {"n": {"uniform": [2, 1]}}}], r"n: expected uniform: \[low, high\] with low < high, got"),
-    ],
-)
-def test_invalid_stages_are_refused(stages: list[dict[str, Any]], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        tictactoe(curriculum=stages)
+    ]
+    for stages, message in rows:
+        with subtests.test(message), pytest.raises(ConfigError, match=message):
+            tictactoe(curriculum=stages)
 
 
 def test_arguments_of_a_stage_are_added_to_those_of_the_game() -> None:
-    config = LeagueConfig.from_mapping(
-        {
-            "league": "spread",
-            "environment": {"entry_point": "mpe2.simple_spread_v3", "kwargs": {"N": 3, "max_cycles": 25}},
-            "training": {"curriculum": [{"kwargs": {"max_cycles": 5}, "steps": 10}, {}]},
-        }
-    )
+    stages = [{"kwargs": {"max_cycles": 5}, "steps": 10}, {}]
+    config = small("mpe2.simple_spread_v3", {"N": 3, "max_cycles": 25}, curriculum=stages)
     assert config.stage_environment(0).kwargs == {"N": 3, "max_cycles": 5}
     assert config.stage_environment(1).kwargs == config.environment.kwargs == {"N": 3, "max_cycles": 25}
     plain = config.with_training(curriculum=[])

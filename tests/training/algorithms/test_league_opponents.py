@@ -1,6 +1,7 @@
 """The candidates of a run, its scores against them, and the draws."""
 
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from ray.rllib.utils.metrics import NUM_EPISODES
 
+from league.config.opponents import OpponentConfig
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, Manifest
@@ -25,10 +27,29 @@ def registry(tmp_path: Path) -> Registry:
     return registries.registered(Registry.open(Storage.at(tmp_path)))
 
 
-def opponents_of(registry: Registry, fixed: tuple[str, ...] = (), **league: Any) -> LeagueOpponents:
+def opponents_of(registry: Registry, *fixed: str, **league: Any) -> LeagueOpponents:
     parts = {"fixed": [{"ref": ref, "share": 0.1} for ref in fixed], "league": league}
     config = registries.config().with_training(opponents=parts)
     return LeagueOpponents(config, registries.interface(), registry.storage)
+
+
+def refreshed(registry: Registry, *fixed: str, **league: Any) -> LeagueOpponents:
+    opponents = opponents_of(registry, *fixed, **league)
+    opponents.refresh()
+    return opponents
+
+
+def publish(registry: Registry, count: int) -> None:
+    for number in range(count):
+        registries.publish(registry, f"run/{len(registry.versions.all('tictactoe'))}/{number}")
+
+
+def promote(registry: Registry, number: int) -> None:
+    registry.aliases.set("tictactoe", "champion", number, expected=ANY, actor="me", reason="test")
+
+
+def refs(*numbers: int) -> tuple[str, ...]:
+    return tuple(f"tictactoe@{number}" for number in numbers)
 
 
 def metrics(episodes: float = 0.0, **results: tuple[float, float]) -> list[dict[str, Any]]:
@@ -43,76 +64,54 @@ def unscored(total: float, results: dict[str, tuple[float, float, float]]) -> li
     return [{NUM_EPISODES: total, "opponents": played}]
 
 
-def publish_exploiter(registry: Registry, source: str, target: str) -> None:
+def publish_exploiter(registry: Registry, target: int) -> None:
     build = registries.builder()
 
     def build_exploiter(directory: Path, number: int) -> Manifest:
-        return build(directory, number).model_copy(update={"role": EXPLOITER, "exploits": target})
+        return build(directory, number).model_copy(update={"role": EXPLOITER, "exploits": f"tictactoe@{target}"})
 
+    source = f"exploiter/{len(registry.versions.all('tictactoe'))}"
     registry.publisher.publish("tictactoe", build_exploiter, source=source, parent=None)
 
 
 def test_an_empty_league_has_no_opponents(registry: Registry) -> None:
-    opponents = opponents_of(registry)
-    opponents.refresh()
+    opponents = refreshed(registry)
     opponents.reset(0)
     assert opponents.active == ()
-    registries.publish(registry, "run/1")
+    publish(registry, 1)
     opponents.refresh()
     opponents.reset(1000)
-    assert [(each.ref, each.share) for each in opponents.active] == [("tictactoe@1", 0.5)]
+    assert [(opponent.ref, opponent.share) for opponent in opponents.active] == [("tictactoe@1", 0.5)]
 
 
 def test_candidates_are_the_newest_versions_and_all_champions(registry: Registry) -> None:
-    for number in range(7):
-        registries.publish(registry, f"run/{number}")
+    publish(registry, 7)
     for champion in (1, 2):
-        registry.aliases.set("tictactoe", "champion", champion, expected=ANY, actor="me", reason="test")
-    opponents = opponents_of(registry, window=2)
-    opponents.refresh()
-    assert opponents.candidates == tuple(f"tictactoe@{number}" for number in (1, 2, 6, 7))
-    opponents = opponents_of(registry, ("tictactoe@7",), window=2, champions=False)
-    opponents.refresh()
-    assert opponents.candidates == ("tictactoe@6",)
+        promote(registry, champion)
+    assert refreshed(registry, window=2).candidates == refs(1, 2, 6, 7)
+    assert refreshed(registry, "tictactoe@7", window=2, champions=False).candidates == refs(6)
 
 
-def test_of_a_mixture_the_members_are_candidates(registry: Registry) -> None:
-    for number in range(6):
-        registries.publish(registry, f"run/{number}")
-    number = registry.publisher.publish_mixture("tictactoe", {1: 0.5, 3: 0.5}).number
-    registry.aliases.set("tictactoe", "champion", number, expected=ANY, actor="me", reason="test")
-    opponents = opponents_of(registry, window=2)
-    opponents.refresh()
-    assert opponents.candidates == tuple(f"tictactoe@{number}" for number in (1, 3, 5, 6))
-
-
-def test_a_search_version_is_no_candidate_but_what_it_plays_is(registry: Registry) -> None:
-    for number in range(3):
-        registries.publish(registry, f"run/{number}")
-    number = registry.publisher.publish_search("tictactoe", 1, "puct", 8, 1.0).number
-    registry.aliases.set("tictactoe", "champion", number, expected=ANY, actor="me", reason="test")
-    opponents = opponents_of(registry, window=1)
-    opponents.refresh()
-    assert opponents.candidates == ("tictactoe@1", "tictactoe@3")
+def test_of_mixtures_and_search_versions_what_they_play_are_candidates(registry: Registry) -> None:
+    publish(registry, 6)
+    promote(registry, registry.publisher.publish_mixture("tictactoe", {1: 0.5, 3: 0.5}).number)
+    assert refreshed(registry, window=2).candidates == refs(1, 3, 5, 6)
+    promote(registry, registry.publisher.publish_search("tictactoe", 2, "puct", 8, 1.0).number)
+    assert refreshed(registry, window=1).candidates == refs(1, 2, 3, 6)
 
 
 def test_the_newest_exploiters_of_champions_are_candidates(registry: Registry) -> None:
-    registries.publish(registry, "run/0")
-    for number, target in enumerate((1, 1, 2), 2):
-        publish_exploiter(registry, f"exploiter/{number}", f"tictactoe@{target}")
-    for number in (5, 6):
-        registries.publish(registry, f"run/{number}")
-    registry.aliases.set("tictactoe", "champion", 1, expected=ANY, actor="me", reason="test")
-    opponents = opponents_of(registry, window=1, champions=False)
-    opponents.refresh()
-    assert opponents.candidates == ("tictactoe@3", "tictactoe@6")
-    opponents = opponents_of(registry, window=3, champions=False, exploiters=False)
-    opponents.refresh()
-    assert opponents.candidates == ("tictactoe@1", "tictactoe@5", "tictactoe@6")
+    publish(registry, 1)
+    for target in (1, 1, 2):
+        publish_exploiter(registry, target)
+    publish(registry, 2)
+    promote(registry, 1)
+    assert refreshed(registry, window=1, champions=False).candidates == refs(3, 6)
+    assert refreshed(registry, window=3, champions=False, exploiters=False).candidates == refs(1, 5, 6)
 
 
 def test_versions_with_another_interface_are_no_candidates(registry: Registry) -> None:
-    registries.publish(registry, "run/1")
+    publish(registry, 1)
     config = registries.config().with_training(opponents={"league": {}})
     opponents = LeagueOpponents(config, registries.interface(squares=8), registry.storage)
     opponents.refresh()
@@ -134,14 +133,13 @@ def test_the_shares_of_opponents_that_are_no_longer_drawn_vanish(registry: Regis
     assert opponents.shares() == {"tictactoe@1": 0.5}
     restored = opponents_of(registry)
     restored.set_state(opponents.get_state())
-    for each in (opponents, restored):
-        each.add(metrics(100.0, v2=(50.0, 20.0)), HALF_LIFE)
-        assert each.shares() == pytest.approx({"tictactoe@1": 25 / 150, "tictactoe@2": 50 / 150})
-        for _ in range(12):
-            each.add(metrics(100.0, v2=(50.0, 20.0)), HALF_LIFE)
-        assert each.shares() == pytest.approx({"tictactoe@2": 0.5}, rel=1e-3)
-        assert each.scores().keys() == each.get_state()["scores"].keys() == {"tictactoe@2"}
-        assert each.score("tictactoe@1") == 0.5
+    restored.add(metrics(100.0, v2=(50.0, 20.0)), HALF_LIFE)
+    assert restored.shares() == pytest.approx({"tictactoe@1": 25 / 150, "tictactoe@2": 50 / 150})
+    for _ in range(12):
+        restored.add(metrics(100.0, v2=(50.0, 20.0)), HALF_LIFE)
+    assert restored.shares() == pytest.approx({"tictactoe@2": 0.5}, rel=1e-3)
+    assert restored.scores().keys() == restored.get_state()["scores"].keys() == {"tictactoe@2"}
+    assert restored.score("tictactoe@1") == 0.5
 
 
 def test_opponents_whose_games_are_not_scored_have_shares(registry: Registry) -> None:
@@ -153,55 +151,48 @@ def test_opponents_whose_games_are_not_scored_have_shares(registry: Registry) ->
 
 def test_the_learners_scores_become_those_of_its_checkpoint(registry: Registry) -> None:
     registries.publish(registry, "other/1")
-    opponents = opponents_of(registry, sampling="nash", forgotten=0, active=1)
-    opponents.refresh()
+    opponents = refreshed(registry, sampling="nash", forgotten=0, active=1)
     opponents.add(metrics(v1=(90.0, 90.0)), 0)
     opponents.refresh(checkpoint="own/1000")
     registries.publish(registry, "own/1000")
     opponents.refresh(checkpoint="own/2000")
     opponents.draw()
-    assert [each.ref for each in opponents.active] == ["tictactoe@2"]
+    assert [opponent.ref for opponent in opponents.active] == ["tictactoe@2"]
     expected = (90 + PRIOR_GAMES / 2) / (90 + PRIOR_GAMES)
     np.testing.assert_allclose(opponents.get_state()["payoff"], [[0.5, 1 - expected], [expected, 0.5]])
 
 
 def test_draws_continue_from_a_saved_state(registry: Registry) -> None:
-    for number in range(6):
-        registries.publish(registry, f"run/{number}")
-    first = opponents_of(registry, sampling="pfsp", active=2)
-    first.refresh()
+    publish(registry, 6)
+    first = refreshed(registry, sampling="pfsp", active=2)
     first.add(metrics(v1=(10.0, 1.0), v2=(10.0, 9.0)), 0)
     first.refresh(checkpoint="own/1000")
     second = opponents_of(registry, sampling="pfsp", active=2)
     second.set_state(first.get_state())
-    draws = []
-    for opponents in (first, second):
+
+    def draws(opponents: LeagueOpponents) -> Iterator[tuple[OpponentConfig, ...]]:
         opponents.reset(1000)
-        drawn = [opponents.active]
-        for _ in range(5):
+        for _ in range(6):
+            yield opponents.active
             opponents.draw()
-            drawn.append(opponents.active)
-        draws.append(drawn)
-    assert draws[0] == draws[1]
-    assert all(len(active) <= 2 for active in draws[0])
-    assert len(set(draws[0])) > 1
+
+    drawn = list(draws(first))
+    assert drawn == list(draws(second))
+    assert all(len(active) <= 2 for active in drawn)
+    assert len(set(drawn)) > 1
 
 
 def test_removed_versions_are_not_drawn_after_resuming(registry: Registry) -> None:
-    for number in range(3):
-        registries.publish(registry, f"run/{number}")
-    opponents = opponents_of(registry, sampling="uniform", window=2)
-    opponents.refresh()
-    state = opponents.get_state() | {"candidates": ("tictactoe@9", "tictactoe@3")}
-    opponents.set_state(state)
+    publish(registry, 3)
+    opponents = refreshed(registry, sampling="uniform", window=2)
+    opponents.set_state(opponents.get_state() | {"candidates": refs(9, 3)})
     opponents.drop_removed()
     opponents.draw()
-    assert [each.ref for each in opponents.active] == ["tictactoe@3"]
+    assert [opponent.ref for opponent in opponents.active] == ["tictactoe@3"]
 
 
 def test_the_prior_is_the_parents_score_in_the_league(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    for number in range(2):
-        registries.publish(registry, f"run/{number}")
+    publish(registry, 2)
     sums = PairSums(matches=1, whole=GameSums(Counter({(30, 12, 48): 1})))
     monkeypatch.setattr(Ledger, "sums", lambda *_: {("tictactoe@1", "tictactoe@2"): sums})
     opponents = opponents_of(registry)
@@ -215,10 +206,8 @@ def test_the_prior_is_the_parents_score_in_the_league(registry: Registry, monkey
 
 
 def test_a_run_from_a_version_counts_its_own_episodes(registry: Registry) -> None:
-    for number in range(2):
-        registries.publish(registry, f"run/{number}")
-    before = opponents_of(registry)
-    before.refresh()
+    publish(registry, 2)
+    before = refreshed(registry)
     before.add(metrics(100.0, v1=(40.0, 10.0)), 0)
     after = opponents_of(registry)
     after.set_state(before.get_state())
@@ -227,34 +216,31 @@ def test_a_run_from_a_version_counts_its_own_episodes(registry: Registry) -> Non
     assert (after.shares(), after.scores()) == ({}, {})
     after.add(metrics(10.0, v2=(5.0, 5.0)), 0)
     assert after.shares() == {"tictactoe@2": 0.5}
-    found, score = after.scores(), after.score("tictactoe@1")
+    scores, score = after.scores(), after.score("tictactoe@1")
     assert score == pytest.approx((10 + PRIOR_GAMES / 2) / (40 + PRIOR_GAMES)), "the scores of the parent's run"
     after.refresh(checkpoint="own/1", parent=2)
-    assert (after.shares(), after.scores()) == ({"tictactoe@2": 0.5}, found)
+    assert (after.shares(), after.scores()) == ({"tictactoe@2": 0.5}, scores)
     resumed = opponents_of(registry)
     resumed.set_state(after.get_state())
     resumed.refresh(checkpoint="own/2", parent=2)
-    assert (resumed.scores(), resumed.score("tictactoe@1")) == (found, score)
+    assert (resumed.scores(), resumed.score("tictactoe@1")) == (scores, score)
 
 
 def test_the_payoff_matrix_has_matches_and_training_games() -> None:
     blocks = [Outcome(("a", "b"), 2, (2.0, 0.0), matches=5)]
-    found = payoff_matrix(("a", "b", "c"), blocks, {"c": {"b": (10.0, 10.0), "unknown": (5.0, 5.0)}})
+    payoffs = payoff_matrix(("a", "b", "c"), blocks, {"c": {"b": (10.0, 10.0), "unknown": (5.0, 5.0)}})
     score = (10 + PRIOR_GAMES / 2) / (10 + PRIOR_GAMES)
-    np.testing.assert_allclose(found, [[0.5, score, 0.5], [1 - score, 0.5, 1 - score], [0.5, score, 0.5]])
+    np.testing.assert_allclose(payoffs, [[0.5, score, 0.5], [1 - score, 0.5, 1 - score], [0.5, score, 0.5]])
 
 
 @pytest.mark.parametrize("window", [1, 3])
 def test_versions_published_since_the_checkpoint_replace_no_opponent_after_resuming(
     registry: Registry, window: int
 ) -> None:
-    for number in range(4):
-        registries.publish(registry, f"run/{number}")
-    first, second = (opponents_of(registry, sampling="uniform", window=window) for _ in range(2))
-    first.refresh()
+    publish(registry, 4)
+    first, second = (build(registry, sampling="uniform", window=window) for build in (refreshed, opponents_of))
     state = first.get_state()
-    for number in range(4, 10):
-        registries.publish(registry, f"run/{number}")
+    publish(registry, 6)
     second.set_state(state)
     second.drop_removed()
     for opponents in (first, second):
@@ -264,12 +250,10 @@ def test_versions_published_since_the_checkpoint_replace_no_opponent_after_resum
 
 def test_the_latest_version_is_no_exploiter(registry: Registry) -> None:
     """In a night, the exploiter of the champion is published last."""
-    registries.publish(registry, "run/1")
-    registry.aliases.set("tictactoe", "champion", 1, expected=None, actor="me", reason="test")
-    registries.publish(registry, "run/2")
-    publish_exploiter(registry, "exploiter/1", "tictactoe@1")
-    opponents = opponents_of(registry, sampling="latest")
-    opponents.refresh()
+    publish(registry, 2)
+    promote(registry, 1)
+    publish_exploiter(registry, 1)
+    opponents = refreshed(registry, sampling="latest")
     opponents.reset(0)
-    assert opponents.candidates == ("tictactoe@3", "tictactoe@1", "tictactoe@2")
-    assert [each.ref for each in opponents.active] == ["tictactoe@2"]
+    assert opponents.candidates == refs(3, 1, 2)
+    assert [opponent.ref for opponent in opponents.active] == ["tictactoe@2"]

@@ -12,11 +12,12 @@ from ray.rllib.core.columns import Columns
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
+from tests.support.algorithms import running
 from tests.support.leagues.training_leagues import tictactoe
 from training.algorithms.rllib_config import algorithm_config
-from training.runs.trial import build_algorithm
 
 CENTRE, CORNER = 4, 0
+UPDATES = 20
 
 
 def recorded(directory: Path, wins: int) -> Path:
@@ -41,24 +42,21 @@ def recorded(directory: Path, wins: int) -> Path:
 
 
 def league(data: Path, **training: float) -> LeagueConfig:
-    return tictactoe(algorithm="marwil", data=str(data), train_batch_size=64, minibatch_size=64, lr=0.01, **training)
+    return tictactoe(algorithm="marwil", data=str(data), train_batch_size=64, minibatch_size=64, lr=0.02, **training)
 
 
 def share_of_centre(league: LeagueConfig, checkpoint: Path) -> float:
     """Train, save, and return the probability of the centre in the first move."""
-    algorithm = build_algorithm(league, interface(league))
-    try:
-        for _ in range(40):
+    with running(league) as algorithm:
+        for _ in range(UPDATES):
             result = algorithm.train()
-        assert result["env_runners"]["num_env_steps_sampled_lifetime"] == 40 * 64
+        assert result["env_runners"]["num_env_steps_sampled_lifetime"] == UPDATES * 64
         algorithm.save_to_path(str(checkpoint))
         observation = {"observation": torch.ones(1, 3, 3, 2), "action_mask": torch.ones(1, 9, dtype=torch.int8)}
         module = algorithm.env_runner_group.local_env_runner.module["shared"]
         with torch.no_grad():
             logits = module.forward_inference({Columns.OBS: observation})[Columns.ACTION_DIST_INPUTS]
         return float(logits.softmax(-1)[0, CENTRE])
-    finally:
-        algorithm.stop()
 
 
 @pytest.mark.usefixtures("ray_session")
@@ -69,13 +67,8 @@ def test_actions_are_imitated_and_advantages_weight_them(tmp_path: Path) -> None
     # Standardised, the advantages are √3 and -1/√3: the weights are 5.7 and 0.56.
     weighted = share_of_centre(league(data, beta=1.0, value_loss=0.0), tmp_path / "weighted")
     assert weighted == pytest.approx(0.77, abs=0.1)
-    continued = build_algorithm(
-        tictactoe(train_batch_size=64, minibatch_size=64), interface(league(data)), tmp_path / "cloned"
-    )
-    try:
+    with running(tictactoe(train_batch_size=64, minibatch_size=64), tmp_path / "cloned") as continued:
         continued.train()
-    finally:
-        continued.stop()
 
 
 def test_unsuitable_settings_are_refused(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from league.config.opponents import LeagueOpponentsConfig, Sampling, Weighting
@@ -19,14 +19,13 @@ def distribution(
     weighting: Weighting = "power",
     forgotten: float = 0.0,
 ) -> np.ndarray:
-    settings = LeagueOpponentsConfig(sampling=sampling, weighting=weighting, forgotten=forgotten)
+    config = LeagueOpponentsConfig(sampling=sampling, weighting=weighting, forgotten=forgotten)
     unknown = np.full((len(scores), len(scores)), NAN)
-    return opponent_distribution(settings, scores, unknown if payoff is None else np.asarray(payoff))
+    return opponent_distribution(config, scores, unknown if payoff is None else np.asarray(payoff))
 
 
-@pytest.mark.parametrize(
-    ("weighting", "scores", "expected"),
-    [
+def test_pfsp_prefers_opponents_that_win(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[Weighting, list[float], list[float]]] = [
         ("power", [1.0, 1.0], [1 / 2, 1 / 2]),
         ("variance", [1.0, 0.0], [1 / 2, 1 / 2]),
         ("linear_capped", [1.0, 1.0, 1.0], [1 / 3, 1 / 3, 1 / 3]),
@@ -39,28 +38,21 @@ def distribution(
         ("power", [NAN, NAN], [1 / 2, 1 / 2]),
         ("power", [1.0, NAN], [0.0, 1.0]),
         ("power", [0.0, NAN], [4 / 5, 1 / 5]),
-    ],
-)
-def test_pfsp_prefers_opponents_that_win(weighting: Weighting, scores: list[float], expected: list[float]) -> None:
-    np.testing.assert_allclose(distribution(scores, weighting=weighting), expected)
+    ]
+    for weighting, scores, expected in rows:
+        with subtests.test(weighting, scores=scores):
+            np.testing.assert_allclose(distribution(scores, weighting=weighting), expected)
 
 
-@pytest.mark.parametrize(("power", "expected"), [(1.0, [2 / 3, 1 / 3]), (2.0, [4 / 5, 1 / 5]), (3.0, [8 / 9, 1 / 9])])
-def test_a_higher_power_prefers_stronger_opponents(power: float, expected: list[float]) -> None:
-    settings = LeagueOpponentsConfig(power=power, forgotten=0.0)
-    np.testing.assert_allclose(opponent_distribution(settings, [0.0, 0.5], np.full((2, 2), NAN)), expected)
+def test_a_higher_power_prefers_stronger_opponents() -> None:
+    config = LeagueOpponentsConfig(power=3.0, forgotten=0.0)
+    np.testing.assert_allclose(opponent_distribution(config, [0.0, 0.5], np.full((2, 2), NAN)), [8 / 9, 1 / 9])
 
 
 def test_forgotten_opponents_have_a_share_of_their_own() -> None:
-    found = distribution([1.0, 0.6, 0.69, 0.7], sampling="latest", forgotten=0.2)
-    np.testing.assert_allclose(found, [0.0, 0.1, 0.1, 0.8])
+    shares = distribution([1.0, 0.6, 0.69, 0.7], sampling="latest", forgotten=0.2)
+    np.testing.assert_allclose(shares, [0.0, 0.1, 0.1, 0.8])
     np.testing.assert_allclose(distribution([1.0, 0.7], sampling="latest", forgotten=0.2), [0.0, 1.0])
-
-
-@pytest.mark.parametrize("sampling", SAMPLINGS)
-def test_without_opponents_there_are_no_probabilities(sampling: Sampling) -> None:
-    assert distribution([], sampling=sampling).shape == (0,)
-    np.testing.assert_allclose(distribution([1.0], sampling=sampling), [1.0])
 
 
 @pytest.mark.parametrize("sampling", ["nash", "alpha_rank"])
@@ -73,21 +65,23 @@ def test_the_meta_strategy_of_the_payoff_matrix(sampling: Sampling) -> None:
 
 
 @given(
-    scores=st.lists(st.floats(0, 1) | st.just(NAN), min_size=1, max_size=6),
+    scores=st.lists(st.floats(0, 1) | st.just(NAN), max_size=6),
     sampling=st.sampled_from(SAMPLINGS),
     weighting=st.sampled_from(["power", "variance", "linear_capped"]),
     forgotten=st.floats(0, 1),
     data=st.data(),
 )
+@settings(max_examples=60)
 def test_probabilities_are_valid(
     scores: list[float], sampling: Sampling, weighting: Weighting, forgotten: float, data: st.DataObject
 ) -> None:
     n = len(scores)
     row = st.lists(st.sampled_from([0.0, 0.25, 0.5, 1.0, NAN]), min_size=n, max_size=n)
     payoff = data.draw(st.lists(row, min_size=n, max_size=n))
-    found = distribution(scores, payoff, sampling=sampling, weighting=weighting, forgotten=forgotten)
-    assert (found >= 0).all()
-    np.testing.assert_allclose(found.sum(), 1.0)
+    shares = distribution(scores, payoff, sampling=sampling, weighting=weighting, forgotten=forgotten)
+    assert shares.shape == (n,)
+    assert (shares >= 0).all()
+    np.testing.assert_allclose(shares.sum(), 1.0 if n else 0.0)
 
 
 @given(weights=st.lists(st.integers(0, 9), min_size=1, max_size=6).filter(any), draws=st.integers(1, 8))

@@ -1,4 +1,4 @@
-"""PPO in this process: it learns, and continues identically from a checkpoint."""
+"""PPO as an algorithm: it learns, with its runners. That it continues identically: `runs/test_trial.py`."""
 
 from typing import Any
 
@@ -20,6 +20,7 @@ from league.config.league import LeagueConfig
 from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from league.errors import ConfigError
+from tests.support.algorithms import running
 from tests.support.environments.training_environments import ROUNDS
 from tests.support.leagues.training_leagues import counting, solvable, tictactoe
 from tests.support.waiting import until
@@ -32,28 +33,16 @@ from training.sampling.episode_chunks import EpisodeChunks
 TWO: dict[str, Any] = {"kwargs": {"agents": 2, "opposed": True}, "policies": {"a": ["player_0"], "b": ["player_1"]}}
 MEMORY = {"recurrence": {"width": 16, "sequence": 8}}
 SMALL: dict[str, Any] = {"train_batch_size": 64, "minibatch_size": 64, "epochs": 1}
-UPDATES = 40
 
 
-def build(league: LeagueConfig) -> PPO:
-    return algorithm_config(league, interface(league)).build_algo()
-
-
-def returns(result: dict[str, Any]) -> dict[str, float]:
-    return result[ENV_RUNNER_RESULTS].get(EPISODE_MODULE_RETURN_MEAN, {})
-
-
-def updates_until(league: LeagueConfig, target: dict[str, float], limit: int = UPDATES) -> int | None:
-    """The number of updates until the mean return of each policy reaches its target; None if it does not."""
-    algorithm = build(league)
-    try:
-        for update in range(limit):
-            found = returns(algorithm.train())
-            if all(found.get(policy, -np.inf) >= value for policy, value in target.items()):
-                return update
-    finally:
-        algorithm.stop()
-    return None
+def learns(league: LeagueConfig, target: dict[str, float], limit: int) -> bool:
+    """Whether the mean return of each policy reaches its target within a number of updates."""
+    with running(league) as algorithm:
+        for _ in range(limit):
+            means = algorithm.train()[ENV_RUNNER_RESULTS].get(EPISODE_MODULE_RETURN_MEAN, {})
+            if all(means.get(policy, -np.inf) >= value for policy, value in target.items()):
+                return True
+    return False
 
 
 @pytest.mark.usefixtures("ray_session")
@@ -76,7 +65,7 @@ def updates_until(league: LeagueConfig, target: dict[str, float], limit: int = U
     ids=["discrete", "multi-discrete", "box", "normalised", "memory", "shared encoder", "independent"],
 )
 def test_ppo_learns(name: str, options: dict[str, Any], target: dict[str, float]) -> None:
-    assert updates_until(solvable(name, **options), target) is not None
+    assert learns(solvable(name, **options), target, limit=40)
 
 
 @pytest.mark.slow
@@ -85,7 +74,7 @@ def test_ppo_learns(name: str, options: dict[str, Any], target: dict[str, float]
     ("name", "below"), [("far_numbers", 0.7 * ROUNDS), ("remembering", 0.4)], ids=["unnormalised", "memoryless"]
 )
 def test_it_does_not_learn_without_the_required_setting(name: str, below: float) -> None:
-    assert updates_until(solvable(name), {"shared": below}, limit=15) is None
+    assert not learns(solvable(name), {"shared": below}, limit=15)
 
 
 @pytest.mark.slow
@@ -117,16 +106,13 @@ def is_lost(runner: Any) -> bool:
 @pytest.mark.usefixtures("ray_session")
 def test_a_runner_lost_before_a_checkpoint_ends_training() -> None:
     """Its sample in flight is not needed, but the runner is."""
-    algorithm = build(tictactoe(runners=1, **SMALL))
-    try:
+    with running(tictactoe(runners=1, **SMALL)) as algorithm:
         algorithm.train()
         (runner,) = algorithm.env_runner_group._worker_manager._actors.values()
         ray.kill(runner)
         until(lambda: is_lost(runner))  # it may answer for a moment
         with pytest.raises(RayActorError):
             algorithm.reset_episodes(64)
-    finally:
-        algorithm.stop()
 
 
 class Recording(PPO):
@@ -201,18 +187,11 @@ def test_equal_seeds_give_equal_weights_while_runners_and_learner_overlap(critic
 def test_phases_follow_the_updates_after_restoring(tmp_path: Any) -> None:
     phases = [{"policies": ["a"], "iterations": 1}, {"policies": ["b"], "iterations": 2}]
     league = solvable("discrete", **TWO, policies_to_train=phases, train_batch_size=128)
-    algorithm = build(league)
-    try:
+    with running(league) as algorithm:
         changed = [changed_policies(algorithm) for _ in range(4)]
         algorithm.save_to_path(str(tmp_path / "checkpoint"))
-    finally:
-        algorithm.stop()
-    restored = build(league)
-    try:
-        restored.restore_from_path(str(tmp_path / "checkpoint"))
+    with running(league, tmp_path / "checkpoint") as restored:
         changed += [changed_policies(restored) for _ in range(3)]
-    finally:
-        restored.stop()
     assert changed == [{"a"}, {"b"}, {"b"}, {"a"}, {"b"}, {"b"}, {"a"}]
 
 
@@ -223,8 +202,7 @@ def test_the_teacher_acts_in_all_runners_while_its_weight_is_not_zero() -> None:
     weight = {"initial": 0.5, "final": 0.0, "steps": 100}
     settings = {"teacher": {"ref": "script:first", "weight": weight}, "policies_to_train": ["b"], "runners": 2}
     league = solvable("discrete", **TWO, **settings, train_batch_size=256)
-    algorithm = build(league)
-    try:
+    with running(league) as algorithm:
         chunks, _ = algorithm.sample_train_batch()
         runners = {(part.name.split("-")[0], part.policy): part.taught is not None for part in chunks}
         assert runners == {("0", "a"): False, ("0", "b"): True, ("1", "a"): False, ("1", "b"): True}
@@ -232,8 +210,6 @@ def test_the_teacher_acts_in_all_runners_while_its_weight_is_not_zero() -> None:
         for steps in (50, 100):
             algorithm.progress = ScheduleProgress(steps, 0.0)
             results.append(algorithm.train()[LEARNER_RESULTS]["b"])
-    finally:
-        algorithm.stop()
     assert [result[TEACHER_WEIGHT] for result in results] == pytest.approx([0.25, 0])
     assert [np.isfinite(result.get(TEACHER_LOSS, np.nan)) for result in results] == [True, False]
 
@@ -252,40 +228,6 @@ def changed_policies(algorithm: PPO) -> set[str]:
     return {policy for policy in after if not np.array_equal(before[policy], after[policy])}
 
 
-@pytest.mark.usefixtures("ray_session")
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [("remembering", MEMORY), ("watching", {"critic": "central", "normalize_values": True})],
-    ids=["memory", "central critic"],
-)
-def test_a_restored_algorithm_continues_identically(name: str, options: dict[str, Any], tmp_path: Any) -> None:
-    """Compares an algorithm that continues after its checkpoint with a restored one."""
-    league = solvable(name, **options, train_batch_size=128)
-    algorithm, weights = build(league), []
-    try:
-        algorithm.train()
-        algorithm.save_to_path(str(tmp_path / "checkpoint"))
-        weights.append(weights_after_reset(algorithm))
-    finally:
-        algorithm.stop()
-    torch.manual_seed(77)
-    restored = build(league)
-    try:
-        restored.restore_from_path(str(tmp_path / "checkpoint"))
-        weights.append(weights_after_reset(restored))
-    finally:
-        restored.stop()
-    assert weights[0].keys() == weights[1].keys()
-    assert all(np.array_equal(value, weights[1][name]) for name, value in weights[0].items())
-
-
-def weights_after_reset(algorithm: PPO) -> dict[str, np.ndarray]:
-    algorithm.reset_episodes(128)
-    for _ in range(2):
-        algorithm.train()
-    return algorithm.get_module("shared").get_state()
-
-
 def test_policies_are_in_the_order_of_the_agents() -> None:
     """Seeded weights and minibatches are drawn in this order; that of a set differs between processes."""
     league = solvable("discrete", {"agents": 7}, {f"policy_{i}": [f"player_{6 - i}"] for i in range(7)})
@@ -294,13 +236,6 @@ def test_policies_are_in_the_order_of_the_agents() -> None:
     spaces = {policy: module_spaces(interface_of_league, policy) for policy in interface_of_league.policy_ids}
     assert interface_of_league.policy_ids == tuple(f"policy_{6 - i}" for i in range(7))
     assert tuple(config.get_multi_rl_module_spec(spaces=spaces).build().keys()) == interface_of_league.policy_ids
-
-
-def test_settings_for_unknown_policies_are_rejected() -> None:
-    for settings in ({"per_policy": {"b": {"lr": 1}}}, {"policies_to_train": ["b"]}):
-        league = tictactoe(**settings)
-        with pytest.raises(ConfigError, match=r"unknown policy"):
-            algorithm_config(league, interface(league))
 
 
 def test_a_central_critic_of_a_single_agent_is_rejected() -> None:

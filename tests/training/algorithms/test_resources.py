@@ -3,7 +3,7 @@
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from league.config.league import LeagueConfig
@@ -39,31 +39,13 @@ def stock(**training: Any) -> LeagueConfig:
     return counting([4, 6], [1], **ALL_AUTO | training)
 
 
-@pytest.mark.parametrize(
-    ("training", "expected"),
-    [
-        ({"train_batch_size": 4096}, 128),
-        ({"train_batch_size": 4096, "runners": 2}, 64),
-        ({"train_batch_size": 512}, 16),
-        ({"train_batch_size": 128, "minibatch_size": 64}, FEWEST_VECTOR_ENVS),
-        ({"train_batch_size": 65536}, 512),
-        ({"train_batch_size": 4096, "num_envs": 7}, 7),
-        ({"algorithm": "dqn"}, 32),
-    ],
-    ids=["batch", "runners", "small batch", "tiny batch", "large batch", "number", "replay buffer"],
-)
-def test_each_agent_gets_enough_steps_of_each_vectorised_environment(training: dict[str, Any], expected: int) -> None:
-    assert resources(vectorised(**training), agents=2).num_envs == expected
-
-
 def test_learners_divide_the_cores_that_runners_leave() -> None:
     assert [resources(vectorised(learners=learners), 2, machine(8)).threads for learners in (1, 2, 4)] == [4, 3, 1]
     assert "2 learners of 3 threads" in describe(vectorised(learners=2), 2, machine(8))
 
 
-@pytest.mark.parametrize(
-    ("training", "nodes", "expected"),
-    [
+def test_there_are_several_learners_only_for_large_minibatches_and_spare_cores(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[dict[str, Any], Nodes, int]] = [
         ({"minibatch_size": 2 * ROWS_PER_LEARNER}, machine(16), 2),
         ({"minibatch_size": 2 * ROWS_PER_LEARNER - 1}, machine(16), 1),
         ({"minibatch_size": 8 * ROWS_PER_LEARNER}, machine(16), 3),
@@ -71,21 +53,17 @@ def test_learners_divide_the_cores_that_runners_leave() -> None:
         ({"minibatch_size": 8 * ROWS_PER_LEARNER}, machine(4), 1),
         ({"minibatch_size": 8 * ROWS_PER_LEARNER, "hidden": [1024]}, machine(16, 2), 1),
         ({"algorithm": "dqn"}, machine(16), 1),
-    ],
-    ids=["large", "small", "by cores", "by threads", "few cores", "gpu", "off-policy"],
-)
-def test_there_are_several_learners_only_for_large_minibatches_and_spare_cores(
-    training: dict[str, Any], nodes: Nodes, expected: int
-) -> None:
-    batch = {} if "algorithm" in training else {"train_batch_size": 2**17}
-    league = vectorised(**batch | training)
-    assert resources(league, 2, nodes).learners == expected
-    assert ("rows" in describe(league, 2, nodes)) == (nodes == machine(16) and "algorithm" not in training)
+    ]
+    for training, nodes, expected in rows:
+        batch = {} if "algorithm" in training else {"train_batch_size": 2**17}
+        league = vectorised(**batch | training)
+        with subtests.test(str(training), nodes=nodes):
+            assert resources(league, 2, nodes).learners == expected
+            assert ("rows" in describe(league, 2, nodes)) == (nodes == machine(16) and "algorithm" not in training)
 
 
-@pytest.mark.parametrize(
-    ("training", "nodes", "expected"),
-    [
+def test_batches_grow_with_the_machine(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[dict[str, Any], Nodes, int]] = [
         ({}, machine(2), 1),
         ({}, machine(4), 2),
         ({}, machine(16), 8),
@@ -98,39 +76,30 @@ def test_there_are_several_learners_only_for_large_minibatches_and_spare_cores(
         ({"steps": 3_000_000, "minutes": None}, machine(16), 4),
         ({"batch_scale": 3}, machine(2), 3),
         ({"algorithm": "dqn"}, machine(16), 1),
-    ],
-)
-def test_batches_grow_with_the_machine(training: dict[str, Any], nodes: Nodes, expected: int) -> None:
-    batch = {} if "algorithm" in training else {"train_batch_size": 4096, "minibatch_size": 512}
-    league = vectorised(**{"steps": None, "minutes": 1.0, **batch, **training})
-    used = resources(league, 2, nodes)
-    assert used.batch_scale == expected
-    assert (f"batches of {expected} times the configured size" in describe(league, 2, nodes)) == (expected > 1)
-
-
-def test_a_larger_batch_has_more_environments() -> None:
-    league = vectorised(train_batch_size=512, minibatch_size=64)
-    scales = (1, 2, 4)
-    used = [resources(league.with_training(batch_scale=scale), 2, machine(2)) for scale in scales]
-    assert [part.num_envs for part in used] == [16, 32, 64]
-    configs = [algorithm_config(league.with_training(**part.settings), interface(league)) for part in used]
-    assert [config.train_batch_size_per_learner for config in configs] == [512, 1024, 2048]
-    assert [config.minibatch_size for config in configs] == [64, 128, 256]
+    ]
+    for training, nodes, expected in rows:
+        batch = {} if "algorithm" in training else {"train_batch_size": 4096, "minibatch_size": 512}
+        league = vectorised(**{"steps": None, "minutes": 1.0, **batch, **training})
+        with subtests.test(str(training), nodes=nodes):
+            assert resources(league, 2, nodes).batch_scale == expected
+            assert (f"batches of {expected} times the" in describe(league, 2, nodes)) == (expected > 1)
 
 
 def test_batches_of_stock_environments_are_not_scaled() -> None:
     assert resources(stock(steps=None, minutes=1.0), 2, machine(64, 8)).batch_scale == 1
 
 
-@pytest.mark.parametrize(("batch", "expected"), [(65536, 32), (512, 16), (32, FEWEST_STOCK_ENVS)])
-def test_a_runner_has_few_stock_environments(batch: int, expected: int) -> None:
-    league = stock(train_batch_size=batch, minibatch_size=32)
-    assert resources(league, agents=2).num_envs == expected
+def test_a_larger_batch_has_more_environments() -> None:
+    league = vectorised(train_batch_size=512, minibatch_size=64)
+    used = [resources(league.with_training(batch_scale=scale), 2, machine(2)) for scale in (1, 2, 4)]
+    assert [part.num_envs for part in used] == [16, 32, 64]
+    configs = [algorithm_config(league.with_training(**part.settings), interface(league)) for part in used]
+    assert [config.train_batch_size_per_learner for config in configs] == [512, 1024, 2048]
+    assert [config.minibatch_size for config in configs] == [64, 128, 256]
 
 
-@pytest.mark.parametrize(
-    ("league", "nodes", "expected"),
-    [
+def test_the_choice_fits_the_nodes_and_each_agent_gets_enough_steps(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[LeagueConfig, Nodes, tuple[float, ...]]] = [
         (vectorised(), machine(1), (0, 128, 1, 0)),
         (vectorised(), machine(2), (1, 128, 1, 0)),
         (vectorised(), machine(16), (2, 64, 4, 0)),
@@ -150,11 +119,20 @@ def test_a_runner_has_few_stock_environments(batch: int, expected: int) -> None:
         (vectorised(algorithm="qmix"), machine(16, 1), (0, 32, 4, 0)),
         (stock(algorithm="dqn", update_every=100), machine(16), (3, 32, 4, 0)),
         (stock(algorithm="dqn", update_every=32), machine(16), (0, 32, 4, 0)),
-    ],
-)
-def test_the_choice_fits_the_nodes(league: LeagueConfig, nodes: Nodes, expected: tuple[float, ...]) -> None:
-    used = resources(league, 2, nodes)
-    assert (used.runners, used.num_envs, used.threads, used.gpus) == expected
+        (vectorised(train_batch_size=512), machine(1), (0, 16, 1, 0)),
+        (vectorised(train_batch_size=128, minibatch_size=64), machine(1), (0, FEWEST_VECTOR_ENVS, 1, 0)),
+        (vectorised(train_batch_size=65536), machine(1), (0, 512, 1, 0)),
+        (vectorised(runners=2), machine(1), (2, 64, 1, 0)),
+        (vectorised(num_envs=7), machine(1), (0, 7, 1, 0)),
+        (vectorised(algorithm="dqn"), machine(1), (0, 32, 1, 0)),
+        (stock(train_batch_size=65536, minibatch_size=32), machine(1), (0, 32, 1, 0)),
+        (stock(train_batch_size=512, minibatch_size=32), machine(1), (0, 16, 1, 0)),
+        (stock(train_batch_size=32, minibatch_size=32), machine(1), (0, FEWEST_STOCK_ENVS, 1, 0)),
+    ]
+    for league, nodes, expected in rows:
+        with subtests.test(training=league.training, nodes=nodes):
+            used = resources(league, 2, nodes)
+            assert (used.runners, used.num_envs, used.threads, used.gpus) == expected
 
 
 any_league = st.builds(
@@ -178,7 +156,6 @@ any_nodes = st.lists(
 )
 
 
-@settings(deadline=None)
 @given(any_league, st.integers(1, 20), any_nodes)
 def test_the_choice_leaves_no_process_without_a_core(league: LeagueConfig, agents: int, nodes: Nodes) -> None:
     used, training = resources(league, agents, nodes), league.training
@@ -188,12 +165,9 @@ def test_the_choice_leaves_no_process_without_a_core(league: LeagueConfig, agent
     assert used.gpus <= max(node["GPU"] for node in nodes)
     samples = used.runners * used.num_envs * agents * STEPS_PER_BATCH
     if training.algorithm == "ppo" and used.runners > 1:
-        assert samples <= training.train_batch_size * used.batch_scale, (
-            "each agent gets enough steps of each environment"
-        )
+        assert samples <= training.train_batch_size * used.batch_scale
 
 
-@settings(deadline=None)
 @given(any_league, st.integers(1, 20), any_nodes, any_nodes)
 def test_what_is_recorded_is_repeated_on_other_nodes(
     league: LeagueConfig, agents: int, nodes: Nodes, others: Nodes
@@ -204,7 +178,6 @@ def test_what_is_recorded_is_repeated_on_other_nodes(
     assert "(" not in describe(recorded, agents, others), "nothing is chosen, so there is no reason"
 
 
-@settings(deadline=None)
 @given(any_league, st.integers(1, 20), st.integers(1, 64), st.integers(0, 64))
 def test_more_cores_never_sample_with_fewer_runners(
     league: LeagueConfig, agents: int, cores: int, further: int
@@ -213,9 +186,8 @@ def test_more_cores_never_sample_with_fewer_runners(
     assert before.runners <= after.runners
 
 
-@pytest.mark.parametrize(
-    ("league", "nodes", "line"),
-    [
+def test_the_choice_and_its_reason_are_one_line(subtests: pytest.Subtests) -> None:
+    rows = [
         (
             vectorised(teacher=TEACHER),
             machine(2),
@@ -239,10 +211,10 @@ def test_more_cores_never_sample_with_fewer_runners(
             machine(16, 1),
             "16 cores, 1 GPU: 14 runners of 1 environment, a learner of 2 threads.",
         ),
-    ],
-)
-def test_the_choice_and_its_reason_are_one_line(league: LeagueConfig, nodes: Nodes, line: str) -> None:
-    assert describe(league, 2, nodes) == line
+    ]
+    for league, nodes, line in rows:
+        with subtests.test(line):
+            assert describe(league, 2, nodes) == line
 
 
 def test_bundled_configurations_use_the_whole_machine_but_for_tiny_networks() -> None:

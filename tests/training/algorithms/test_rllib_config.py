@@ -29,30 +29,27 @@ def training_with_policies(policies: Any, **training: Any) -> Any:
     return tictactoe(policies_to_train=policies, **training).training
 
 
-@pytest.mark.parametrize(("policies", "expected"), [(None, POLICIES), (["c", "a"], ("a", "c"))])
-def test_a_list_applies_to_every_update(policies: Any, expected: tuple[str, ...]) -> None:
-    assert [learning_policies(training_with_policies(policies), POLICIES, i) for i in range(3)] == [expected] * 3
+def test_a_list_applies_to_every_update_and_phases_are_cyclic() -> None:
+    phases = [{"policies": ["a"], "iterations": 2}, {"policies": ["c", "b"], "iterations": 1}]
+    for policies, expected in (
+        (None, [POLICIES] * 7),
+        (["c", "a"], [("a", "c")] * 7),
+        (phases, [("a",), ("a",), ("b", "c")] * 2 + [("a",)]),
+    ):
+        settings = training_with_policies(policies)
+        check_policies_to_train(settings, POLICIES)
+        assert [learning_policies(settings, POLICIES, update) for update in range(7)] == expected
 
 
-def test_phases_are_cyclic() -> None:
-    settings = training_with_policies([{"policies": ["a"], "iterations": 2}, {"policies": ["c", "b"], "iterations": 1}])
-    check_policies_to_train(settings, POLICIES)
-    found = [learning_policies(settings, POLICIES, i) for i in range(7)]
-    assert found == [("a",), ("a",), ("b", "c")] * 2 + [("a",)]
-
-
-@pytest.mark.parametrize("policies", [["a", "d"], [{"policies": ["d"], "iterations": 1}]])
-def test_an_unknown_policy_is_reported(policies: Any) -> None:
-    with pytest.raises(ConfigError, match="policies_to_train: unknown policy 'd'; the league has a, b, c"):
-        check_policies_to_train(training_with_policies(policies), POLICIES)
-
-
-@pytest.mark.parametrize("policies", [["a"], [{"policies": ["a"], "iterations": 1}]])
-def test_policies_with_a_shared_encoder_must_learn_together(policies: Any) -> None:
-    with pytest.raises(ConfigError, match="with shared_encoder, all policies must learn together"):
-        check_policies_to_train(training_with_policies(policies, shared_encoder=True), POLICIES)
-    check_policies_to_train(training_with_policies(list(POLICIES), shared_encoder=True), POLICIES)
-    check_policies_to_train(training_with_policies(None, shared_encoder=True), POLICIES)
+def test_unknown_policies_and_a_part_of_those_with_a_shared_encoder_are_refused() -> None:
+    for unknown in (["a", "d"], [{"policies": ["d"], "iterations": 1}]):
+        with pytest.raises(ConfigError, match="policies_to_train: unknown policy 'd'; the league has a, b, c"):
+            check_policies_to_train(training_with_policies(unknown), POLICIES)
+    for part in (["a"], [{"policies": ["a"], "iterations": 1}]):
+        with pytest.raises(ConfigError, match="with shared_encoder, all policies must learn together"):
+            check_policies_to_train(training_with_policies(part, shared_encoder=True), POLICIES)
+    for together in (list(POLICIES), None):
+        check_policies_to_train(training_with_policies(together, shared_encoder=True), POLICIES)
 
 
 def test_opponents_are_not_drawn_by_scores_that_games_do_not_have() -> None:
@@ -64,18 +61,14 @@ def test_opponents_are_not_drawn_by_scores_that_games_do_not_have() -> None:
     check_opponents(two, interface(two))
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "dqn"])
-def test_fast_seeds_need_an_environment_that_has_them(algorithm: str) -> None:
-    league = tictactoe(algorithm=algorithm, seeds="fast")
+def test_fast_seeds_need_an_environment_that_has_them() -> None:
+    for name in ("kuhn_poker", "leduc_holdem"):
+        league = LeagueConfig.load(bundled.find(name))
+        assert league.training.seeds == "fast"
+        check(league, interface(league))
+    league = tictactoe(algorithm="dqn", seeds="fast")
     with pytest.raises(ConfigError, match=r"training\.seeds: pettingzoo\.classic\.tictactoe_v3 has no fast seeds"):
         check(league, interface(league))
-
-
-@pytest.mark.parametrize("name", ["kuhn_poker", "leduc_holdem"])
-def test_bundled_configurations_use_the_fast_seeds_of_their_environments(name: str) -> None:
-    league = LeagueConfig.load(bundled.find(name))
-    assert league.training.seeds == "fast"
-    check(league, interface(league))
 
 
 ALGORITHM = """
@@ -167,7 +160,7 @@ def test_an_update_without_finished_episodes_has_no_returns() -> None:
         ENV_RUNNER_RESULTS: {EPISODE_RETURN_MEAN: float("nan"), EPISODE_MODULE_RETURN_MEAN: {"shared": float("nan")}},
         LEARNER_RESULTS: {"shared": {"policy_loss": float("nan"), "loss": 2.0}},
     }
-    found = training_metrics(result, interface(tictactoe()), PPO_METRICS | OFF_POLICY_METRICS)
-    assert found.keys() == {"shared/policy_loss", "shared/loss"}
+    metrics = training_metrics(result, interface(tictactoe()), PPO_METRICS | OFF_POLICY_METRICS)
+    assert metrics.keys() == {"shared/policy_loss", "shared/loss"}
     result[ENV_RUNNER_RESULTS][EPISODE_RETURN_MEAN] = 1.5
     assert training_metrics(result, interface(tictactoe()))["return"] == 1.5

@@ -14,20 +14,20 @@ from league.errors import ParityError
 from league.interface import Interface
 from league.policies.actions import dist_inputs_size
 from league.policies.onnx import OnnxPolicy
-from league.spaces import MultiDiscrete
 from league.spaces.conversion import to_gymnasium
 from tests.support.leagues.training_leagues import counting, solvable, solvable_by_dqn, tictactoe
 from training.algorithms import rllib_config
 from training.algorithms.rllib_config import module_spec
 from training.export import parity
 from training.export.onnx_export import export_policy, graph_tensors
-from training.export.parity import ObservedBatch
 from training.importing.source import onnx_source
 from training.modules.actor_critic import ActorCritic
 from training.modules.policy_module import MASKED_LOGIT
 
 CONVOLVED = {"convolutions": [{"filters": 4, "kernel": 2}], "hidden": [8]}
 MEMORY = {"recurrence": {"width": 6}}
+FEW = 256
+"""Observations, which are more for a published version."""
 
 
 def modules_of(league: LeagueConfig) -> tuple[Interface, dict[str, ActorCritic]]:
@@ -41,38 +41,43 @@ def modules_of(league: LeagueConfig) -> tuple[Interface, dict[str, ActorCritic]]
     return interface_of_league, {policy: modules[policy] for policy in interface_of_league.policy_ids}
 
 
-Exported = tuple[Interface, ActorCritic, Path, list[ObservedBatch]]
-
-
 @pytest.fixture(autouse=True)
 def few_observations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fewer than for a published version. `exported` has as many as that."""
-    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, observations=400))
+    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, observations=FEW))
+
+
+class Played:
+    """A policy of a league, and observations from its play."""
+
+    def __init__(self, league: LeagueConfig) -> None:
+        self.interface, modules = modules_of(league)
+        self.module, self.spaces = modules["shared"], self.interface.of_policy("shared")
+        self.observed = parity.collect_observations(league.environment, self.interface, modules, seed=1)["shared"]
+
+    def export(self, path: Path, **changed: Any) -> None:
+        export_policy(self.module, self.spaces.model_copy(update=changed), path)
+
+    def check_parity(self, path: Path, module: ActorCritic | None = None) -> Any:
+        return parity.check_parity(path, "shared", module or self.module, self.observed, self.spaces.action)
+
+    def copied_module(self) -> ActorCritic:
+        copied = module_spec(tictactoe(**CONVOLVED).training, self.interface).build()["shared"]
+        copied.set_state(self.module.get_state())
+        return copied
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
-    """A masked convolutional policy, its graph, and observations from its environment."""
-    league = tictactoe(**CONVOLVED)
-    interface_of_league, modules = modules_of(league)
+def played() -> Played:
+    """A masked convolutional policy, with as many observations as for a published version."""
+    return Played(tictactoe(**CONVOLVED))
+
+
+@pytest.fixture(scope="module")
+def path(played: Played, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its graph."""
     path = tmp_path_factory.mktemp("export") / "shared.onnx"
-    export_policy(modules["shared"], interface_of_league.of_policy("shared"), path)
-    observed = parity.collect_observations(league.environment, interface_of_league, modules, seed=1)["shared"]
-    return interface_of_league, modules["shared"], path, observed
-
-
-def check_parity(exported: Exported, path: Path | None = None, module: ActorCritic | None = None) -> Any:
-    interface_of_league, own, graph, observed = exported
-    return parity.check_parity(
-        path or graph, "shared", module or own, observed, interface_of_league.of_policy("shared").action
-    )
-
-
-def copy_of(exported: Exported) -> ActorCritic:
-    interface_of_league, module, *_ = exported
-    other = module_spec(tictactoe(**CONVOLVED).training, interface_of_league).build()["shared"]
-    other.set_state(module.get_state())
-    return other
+    played.export(path)
+    return path
 
 
 def check_graph(
@@ -83,79 +88,72 @@ def check_graph(
     onnx.checker.check_model(model)
     assert not any(tensor.external_data for tensor in model.graph.initializer)
     session = onnxruntime.InferenceSession(path)
-    taken, answered, state = graph_tensors(module, interface_of_league.of_policy(policy))
+    inputs, outputs, state = graph_tensors(module, interface_of_league.of_policy(policy))
     types = {"float32": "float", "float64": "double"}
-    for tensors, nodes in ((taken, session.get_inputs()), (answered, session.get_outputs())):
+    for tensors, nodes in ((inputs, session.get_inputs()), (outputs, session.get_outputs())):
         assert [node.name for node in nodes] == [tensor.name for tensor in tensors]
         assert [tuple(node.shape[1:]) for node in nodes] == [tensor.shape[1:] for tensor in tensors]
         assert [node.type for node in nodes] == [f"tensor({types.get(t.dtype, t.dtype)})" for t in tensors]
         assert all(isinstance(node.shape[0], str) for node in nodes)
-    assert state == tuple(tensor for tensor in taken if tensor.name.startswith("state_in_"))
+    assert state == tuple(tensor for tensor in inputs if tensor.name.startswith("state_in_"))
     return session
 
 
-def test_the_graph_is_one_file_with_the_names_and_dtypes_of_the_environment(exported: Exported) -> None:
-    interface_of_league, module, path, _ = exported
-    session = check_graph(path, module, interface_of_league, "shared")
+def test_the_graph_is_one_file_with_the_names_and_dtypes_of_the_environment(played: Played, path: Path) -> None:
+    session = check_graph(path, played.module, played.interface, "shared")
     assert list(path.parent.iterdir()) == [path]
     assert [node.type for node in session.get_inputs()] == ["tensor(int8)", "tensor(int8)"]
     assert [node.type for node in session.get_outputs()] == ["tensor(int64)", "tensor(float)"]
 
 
-def test_observations_are_collected_by_play(exported: Exported) -> None:
-    *_, observed = exported
-    planes = np.concatenate([part.observations["observation"] for part in observed])
-    masks = np.concatenate([part.observations["action_mask"] for part in observed])
+def test_observations_are_collected_by_play(played: Played) -> None:
+    planes, masks = (
+        np.concatenate([part.observations[name] for part in played.observed]) for name in ("observation", "action_mask")
+    )
     assert len(planes) >= 2000
     assert planes.dtype == masks.dtype == np.int8
     assert (planes.reshape(len(planes), -1).sum(-1) + masks.sum(-1) == 9).all(), "occupied and free cells"
     assert len(np.unique(planes.reshape(len(planes), -1), axis=0)) > 500
 
 
-def test_parity_holds_and_actions_are_legal_in_any_batch(exported: Exported) -> None:
-    _, _, path, observed = exported
-    parity_result = check_parity(exported)
-    assert parity_result.observations >= 2000
-    assert parity_result.mismatches == 0
-    assert parity_result.max_difference < 1e-4
-    policy = OnnxPolicy(path)
-    rows = {
-        name: np.concatenate([part.observations[name] for part in observed[:20]]) for name in observed[0].observations
-    }
+def test_parity_holds_and_actions_are_legal_in_any_batch(played: Played, path: Path) -> None:
+    proof = played.check_parity(path)
+    assert (proof.observations >= 2000, proof.mismatches, proof.max_difference < 1e-4) == (True, 0, True)
+    policy, parts = OnnxPolicy(path), played.observed[:20]
+    rows = {name: np.concatenate([part.observations[name] for part in parts]) for name in parts[0].observations}
     together = policy.act(rows).actions
     singly = [policy.act({name: array[i : i + 1] for name, array in rows.items()}).actions[0] for i in range(50)]
     assert together[:50].tolist() == singly
     assert (rows["action_mask"][np.arange(len(together)), together] == 1).all()
 
 
-def test_another_network_than_that_of_the_graph_is_rejected(exported: Exported) -> None:
-    other = copy_of(exported)
+def test_another_network_than_that_of_the_graph_is_rejected(played: Played, path: Path) -> None:
+    other, warmer = played.copied_module(), played.copied_module()
     with torch.no_grad():
         other.policy_head.weight[4] += 2
-    with pytest.raises(ParityError, match=r"differs from its module on [1-9]\d* of 2\d\d\d greedy actions"):
-        check_parity(exported, module=other)
-    warmer = copy_of(exported)  # the same greedy actions at another temperature
-    with torch.no_grad():
         warmer.policy_head.weight *= 2
         warmer.policy_head.bias *= 2
+    with pytest.raises(ParityError, match=r"differs from its module on [1-9]\d* of 2\d\d\d greedy actions"):
+        played.check_parity(path, other)
+    # The same greedy actions at another temperature.
     with pytest.raises(ParityError, match="on 0 of"):
-        check_parity(exported, module=warmer)
+        played.check_parity(path, warmer)
     with torch.no_grad():
         other.policy_head.bias.fill_(float("nan"))
     with pytest.raises(ParityError, match="diverged"):
-        check_parity(exported, module=other)
+        played.check_parity(path, other)
 
 
-def test_near_ties_are_counted_but_accepted(exported: Exported, tmp_path: Path) -> None:
+def test_near_ties_are_counted_but_accepted(played: Played, tmp_path: Path) -> None:
     """Two modules whose two best actions swap by less than 1e-5."""
-    first, second = copy_of(exported), copy_of(exported)
+    first, second = played.copied_module(), played.copied_module()
     for net, bias in ((first, [4e-6, 0.0]), (second, [0.0, 4e-6])):
         with torch.no_grad():
             net.policy_head.weight.zero_()
             net.policy_head.bias.copy_(torch.tensor([*bias, *[-1.0] * 7]))
-    export_policy(second, exported[0].of_policy("shared"), tmp_path / "second.onnx")
-    proof = check_parity(exported, tmp_path / "second.onnx", first)
-    masks = np.concatenate([part.observations["action_mask"] for part in exported[3]])
+    export_policy(second, played.spaces, tmp_path / "second.onnx")
+    proof = played.check_parity(tmp_path / "second.onnx", first)
+    masks = np.concatenate([part.observations["action_mask"] for part in played.observed])
     assert proof.mismatches == 0
     assert proof.near_ties == (masks[:, :2] == 1).all(-1).sum() > 0
 
@@ -180,9 +178,8 @@ def test_near_ties_are_accepted_if_the_previous_action_is_an_input(tmp_path: Pat
     assert proof.near_ties > 0
 
 
-def test_masked_logits_are_exported_unchanged(exported: Exported) -> None:
-    _, _, path, observed = exported
-    observations = observed[-1].observations
+def test_masked_logits_are_exported_unchanged(played: Played, path: Path) -> None:
+    observations = played.observed[-1].observations
     logits = OnnxPolicy(path).distribution(observations).dist_inputs
     assert ((logits == np.float32(MASKED_LOGIT)) == (observations["action_mask"] == 0)).all()
 
@@ -226,8 +223,7 @@ def test_each_kind_of_policy_equals_its_module(league: LeagueConfig, tmp_path: P
         check_graph(path, module, interface_of_league, policy)
         onnx_source(path, None, spaces, {})  # it can be imported: time and memory are bounded
         proof = parity.check_parity(path, policy, module, observed[policy], spaces.action)
-        assert proof.observations >= 400
-        assert proof.mismatches == 0
+        assert (proof.observations >= FEW, proof.mismatches) == (True, 0)
         answer = OnnxPolicy(path).distribution(observed[policy][0].observations)
         assert answer.dist_inputs is not None
         assert answer.dist_inputs.shape[1] == dist_inputs_size(spaces.action)
@@ -235,9 +231,7 @@ def test_each_kind_of_policy_equals_its_module(league: LeagueConfig, tmp_path: P
 
 
 def test_states_are_carried_through_episodes_and_reset_between_them() -> None:
-    league = LEAGUES["memory"]
-    interface_of_league, modules = modules_of(league)
-    observed = parity.collect_observations(league.environment, interface_of_league, modules, seed=1)["shared"]
+    observed = Played(LEAGUES["memory"]).observed
     begins = np.concatenate([part.observations["observation"] != 2 for part in observed])
     for key in ("h", "c"):
         is_zero = (np.concatenate([part.state[key] for part in observed]) == 0).all(-1)
@@ -247,37 +241,25 @@ def test_states_are_carried_through_episodes_and_reset_between_them() -> None:
 
 def test_a_graph_with_another_state_is_rejected(tmp_path: Path) -> None:
     """A weight differs that affects only the next step."""
-    league, path = LEAGUES["memory"], tmp_path / "shared.onnx"
-    interface_of_league, modules = modules_of(league)
-    spaces, module = interface_of_league.of_policy("shared"), modules["shared"]
-    observed = parity.collect_observations(league.environment, interface_of_league, modules, seed=1)["shared"]
+    played, path = Played(LEAGUES["memory"]), tmp_path / "shared.onnx"
     with torch.no_grad():
-        module.policy_head.weight.zero_()
-    export_policy(module, spaces, path)
-    parity.check_parity(path, "shared", module, observed, spaces.action)
-    assert module.recurrent is not None
+        played.module.policy_head.weight.zero_()
+    played.export(path)
+    played.check_parity(path)
+    assert played.module.recurrent is not None
     with torch.no_grad():
-        module.recurrent.lstm.bias_ih_l0 += 0.1
+        played.module.recurrent.lstm.bias_ih_l0 += 0.1
     with pytest.raises(ParityError, match="differs from its module on 0 of"):
-        parity.check_parity(path, "shared", module, observed, spaces.action)
+        played.check_parity(path)
 
 
-@pytest.mark.parametrize("name", ["multi", "box"])
-def test_a_graph_with_other_actions_is_rejected(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "changed"), [("multi", {"start": [1, 0]}), ("box", {"high": [2.001, 10.0]})])
+def test_a_graph_with_other_actions_is_rejected(name: str, changed: dict[str, Any], tmp_path: Path) -> None:
     """The graph scales or shifts actions differently from the action space."""
-    league = LEAGUES[name]
-    interface_of_league, modules = modules_of(league)
-    spaces, module = interface_of_league.of_policy("shared"), modules["shared"]
-    other = (
-        spaces.action.model_copy(update={"start": [1, 0]})
-        if isinstance(spaces.action, MultiDiscrete)
-        else spaces.action.model_copy(update={"high": [2.001, 10.0]})
-    )
-    path = tmp_path / "other.onnx"
-    export_policy(module, spaces.model_copy(update={"action": other}), path)
-    observed = parity.collect_observations(league.environment, interface_of_league, modules, seed=1)["shared"]
+    played, path = Played(LEAGUES[name]), tmp_path / "other.onnx"
+    played.export(path, action=played.spaces.action.model_copy(update=changed))
     with pytest.raises(ParityError, match=r"on [1-9]\d* of \d+ greedy actions"):
-        parity.check_parity(path, "shared", module, observed, spaces.action)
+        played.check_parity(path)
 
 
 def test_a_policy_that_rarely_acts_cannot_be_checked(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -291,14 +273,8 @@ def test_a_policy_that_rarely_acts_cannot_be_checked(monkeypatch: pytest.MonkeyP
 def test_slow_and_large_environments_are_compared_on_fewer_observations(monkeypatch: pytest.MonkeyPatch) -> None:
     league = LEAGUES["counting"]
     interface_of_league, modules = modules_of(league)
-
-    def counts() -> list[int]:
+    limits = replace(parity.EXPORTED, observations=400)
+    for changed, least, most in (({}, 400, 999), ({"enough_seconds": -1}, 256, 300), ({"megabytes": 0}, 256, 300)):
+        monkeypatch.setattr(parity, "EXPORTED", replace(limits, **changed))
         observed = parity.collect_observations(league.environment, interface_of_league, modules, seed=1)
-        return [sum(map(len, observed[policy])) for policy in interface_of_league.policy_ids]
-
-    assert min(counts()) >= parity.EXPORTED.observations
-    with monkeypatch.context() as patched:
-        patched.setattr(parity, "EXPORTED", replace(parity.EXPORTED, enough_seconds=-1))
-        assert 256 <= min(counts()) < 300
-    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, megabytes=0))
-    assert 256 <= min(counts()) < 300
+        assert least <= min(sum(map(len, batches)) for batches in observed.values()) < most

@@ -1,6 +1,8 @@
 import json
 import subprocess
 from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,25 +20,22 @@ from league.registry.storage.manifest import TRAINING
 from league.settings import Storage
 from league.spaces import Discrete
 from league.stack import installed
+from tests.support.algorithms import running
 from tests.support.leagues.training_leagues import solvable, tictactoe
+from training.export import parity
 from training.export import publish as publishing
 from training.export.publish import Checkpoint, git_commit, load_modules, load_scales, publish
-from training.runs.trial import build_algorithm
 
 LEAGUE = tictactoe(train_batch_size=64, minibatch_size=32, epochs=1, normalize_values=True)
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+def trained(ray_session: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """RLlib's state after one update, in this process and without Tune."""
-    request.getfixturevalue("ray_session")
-    algorithm = build_algorithm(LEAGUE, interface(LEAGUE))
-    try:
+    path = tmp_path_factory.mktemp("trained") / "64"
+    with running(LEAGUE) as algorithm:
         algorithm.train()
-        path = tmp_path_factory.mktemp("trained") / "64"
         algorithm.save_to_path(str(path))
-    finally:
-        algorithm.stop()
     return path
 
 
@@ -95,17 +94,14 @@ def test_a_version_has_a_complete_manifest_and_acts_like_its_checkpoint(registry
 
 
 @pytest.mark.usefixtures("ray_session")
-def test_a_recurrent_policy_is_exported_with_its_state(tmp_path: Path) -> None:
+def test_a_recurrent_policy_is_exported_with_its_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, observations=256))
     league = solvable("remembering", recurrence={"width": 4}, train_batch_size=128)
     interface_of_league = interface(league)
-    algorithm = build_algorithm(league, interface_of_league)
-    try:
+    with running(league) as algorithm:
         algorithm.save_to_path(str(tmp_path / "0"))
-    finally:
-        algorithm.stop()
-    registry = Registry.open(Storage.at(tmp_path / "home"))
-    registry.leagues.register(league, interface_of_league)
-    try:
+    with closing(Registry.open(Storage.at(tmp_path / "home"))) as registry:
+        registry.leagues.register(league, interface_of_league)
         source = Checkpoint(tmp_path / "0", source="run/0", steps=0)
         row = publish(
             source, registry=registry, config=league, interface=interface_of_league, parent=None, git_commit=None
@@ -118,22 +114,20 @@ def test_a_recurrent_policy_is_exported_with_its_state(tmp_path: Path) -> None:
         assert probes.state["state_in_1"].any(), "no probe is from within an episode"
         policy = load(row.ref, registry=registry)
         batch, state = {"observation": np.array([1, 0])}, None
-        seen = []
+        outputs = []
         for _ in range(3):
             answer = policy.act(batch, state=state, explore=True, rng=[np.random.default_rng(0)] * 2)
             state = answer.state
             assert answer.dist_inputs is not None
-            seen.append(answer.dist_inputs)
-        assert not np.array_equal(seen[0], seen[1])
+            outputs.append(answer.dist_inputs)
+        assert not np.array_equal(outputs[0], outputs[1])
         module = load_modules(tmp_path / "0", league, interface_of_league)["shared"]
         again = {"obs": {"observation": torch.tensor([1, 0])}}
         before = {key: torch.zeros(2, 4) for key in module.get_initial_state()}
-        for expected in seen:
-            found = module.forward_inference(again | {"state_in": before})
-            np.testing.assert_allclose(found["action_dist_inputs"], expected, atol=1e-6)
-            before = found["state_out"]
-    finally:
-        registry.close()
+        for expected in outputs:
+            answer_of_module = module.forward_inference(again | {"state_in": before})
+            np.testing.assert_allclose(answer_of_module["action_dist_inputs"], expected, atol=1e-6)
+            before = answer_of_module["state_out"]
 
 
 def test_a_failed_parity_check_leaves_no_version(

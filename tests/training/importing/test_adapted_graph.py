@@ -70,11 +70,11 @@ def test_greedy_actions_equal_those_of_the_source(
         observations["action_mask"][:, [0, 2]] = 1
     policy = OnnxPolicy(adapt(model, names, spaces, "test"))
     expected, _, _ = OnnxOriginal(model, names, spaces, "test").act(observations, {})
-    given = policy.distribution(observations)
-    np.testing.assert_allclose(given.actions, expected, rtol=1e-5, atol=1e-5)
-    assert given.actions.dtype == action.dtype
-    assert given.dist_inputs is not None
-    assert np.isfinite(given.dist_inputs).all()
+    actions = policy.distribution(observations)
+    np.testing.assert_allclose(actions.actions, expected, rtol=1e-5, atol=1e-5)
+    assert actions.actions.dtype == action.dtype
+    assert actions.dist_inputs is not None
+    assert np.isfinite(actions.dist_inputs).all()
 
 
 def test_recurrent_state_is_passed_on() -> None:
@@ -88,9 +88,9 @@ def test_recurrent_state_is_passed_on() -> None:
     for seed in range(4):
         observations = {"observation": np.random.default_rng(seed).normal(size=(ROWS, 6)).astype(np.float32)}
         expected, _, state = original.act(observations, state)
-        given = policy.act(observations, state=ours)
-        ours = given.state
-        assert given.actions.tolist() == expected.tolist()
+        actions = policy.act(observations, state=ours)
+        ours = actions.state
+        assert actions.actions.tolist() == expected.tolist()
         assert ours is not None
         np.testing.assert_allclose(ours["state_in_0"], state["hidden_in"], rtol=1e-6)
 
@@ -105,31 +105,23 @@ def test_tensors_are_matched_by_shape() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
+def test_a_mapping_that_does_not_fit_is_rejected(subtests: pytest.Subtests) -> None:
+    model, spaces = onnx.load_from_string(foreign(6, 5)), AgentInterface(observation=masked(5), action=DISCRETE)
+    fitting = {"inputs": {"planes": "observation"}, "output": "policy_head", "kind": "logits"}
+    transposed = {"planes": {"name": "observation", "transpose": [0]}}
+    rows: list[tuple[dict[str, Any], str]] = [
         ({"inputs": {"board": "observation"}}, "input planes of the graph is not in the mapping"),
         ({"inputs": {"planes": "pixels"}}, "inputs.planes: the league has no pixels"),
         ({"inputs": {"planes": "action_mask"}}, r"input planes has shape \[6\], but action_mask has \[5\]"),
-        (
-            {"inputs": {"planes": {"name": "observation", "transpose": [0]}}},
-            "inputs.planes.transpose: observation has 2 axes",
-        ),
+        ({"inputs": transposed}, "inputs.planes.transpose: observation has 2 axes"),
         ({"output": "value"}, "output value: the graph has the outputs policy_head"),
         ({"kind": "gaussian"}, "kind: gaussian does not fit discrete actions"),
         ({"state": {"h": "policy_head"}}, "state.h: expected an input"),
-    ],
-)
-def test_a_mapping_that_does_not_fit_is_rejected(changed: dict[str, Any], message: str) -> None:
-    model = onnx.load_from_string(foreign(6, 5))
-    fitting = {"inputs": {"planes": "observation"}, "output": "policy_head", "kind": "logits"}
-    with pytest.raises(EnvironmentMismatch, match=f"model.onnx: {message}"):
-        adapt(
-            model,
-            GraphMapping(**fitting | changed),
-            AgentInterface(observation=masked(5), action=DISCRETE),
-            "model.onnx",
-        )
+    ]
+    for changed, message in rows:
+        mapping = GraphMapping(**fitting | changed)
+        with subtests.test(message), pytest.raises(EnvironmentMismatch, match=f"model.onnx: {message}"):
+            adapt(model, mapping, spaces, "model.onnx")
 
 
 def test_what_cannot_be_matched_is_named() -> None:

@@ -45,7 +45,7 @@ def model(nodes: Sequence[NodeProto], domains: Sequence[str] = (), functions: Se
         "never": np.int64(2**62),
     }  # fmt: skip
     nodes = [node("Identity", ["planes"], ["seen"]), *nodes, node("MatMul", ["seen", "w"], ["policy_head"])]
-    used = {name for each in nodes for name in each.input}
+    used = {name for operation in nodes for name in operation.input}
     weights = [numpy_helper.from_array(value, name) for name, value in constants.items() if name in used]
     graph = helper.make_graph(nodes, "foreign", [info("planes", "N", 6)], [info("policy_head", "N", 5)], weights)
     opsets = [helper.make_opsetid(domain, 18 if not domain else 1) for domain in ("", *domains)]
@@ -55,9 +55,9 @@ def model(nodes: Sequence[NodeProto], domains: Sequence[str] = (), functions: Se
 def body() -> GraphProto:
     """Of a loop: counts."""
     nodes = [node("Identity", ["on"], ["still"]), node("Add", ["count", "step"], ["next"])]
-    given = [info("i", kind=TensorProto.INT64), info("on", kind=TensorProto.BOOL), info("count")]
+    inputs = [info("i", kind=TensorProto.INT64), info("on", kind=TensorProto.BOOL), info("count")]
     results = [info("still", kind=TensorProto.BOOL), info("next")]
-    return helper.make_graph(nodes, "body", given, results, [numpy_helper.from_array(np.float32(1), "step")])
+    return helper.make_graph(nodes, "body", inputs, results, [numpy_helper.from_array(np.float32(1), "step")])
 
 
 LARGEST = [
@@ -178,24 +178,27 @@ def test_a_size_that_depends_on_values_is_refused(operator: str) -> None:
         bounded(graph, MAPPING, spaces(6), "a.onnx")
 
 
-def test_an_endless_loop_is_not_imported(tmp_path: Path) -> None:
+@pytest.fixture
+def interface() -> Interface:
+    return Interface(agents={"agent": spaces(6)}, policies={"agent": "shared"}, sides={"agent": ("agent",)})
+
+
+def test_an_endless_loop_is_not_imported(tmp_path: Path, interface: Interface) -> None:
     """It ends for all observations in play: their largest number is never 2."""
-    path, agent = tmp_path / "endless.onnx", spaces(6)
+    path = tmp_path / "endless.onnx"
     path.write_bytes(model([*LARGEST, *LOOP]).SerializeToString())
-    interface = Interface(agents={"agent": agent}, policies={"agent": "shared"}, sides={"agent": ("agent",)})
     with pytest.raises(InvalidInput, match=r"endless.onnx: operator Loop of node 'endless' has a graph of its own"):
         open_sources(path, interface)
 
 
-def test_weights_outside_of_the_directory_are_not_read(tmp_path: Path) -> None:
+def test_weights_outside_of_the_directory_are_not_read(tmp_path: Path, interface: Interface) -> None:
     (tmp_path / "secret").write_bytes(bytes(120))
     (tmp_path / "models").mkdir()
     path = tmp_path / "models" / "a.onnx"
     (path.parent / "link").symlink_to(tmp_path / "secret")
-    interface = Interface(agents={"a": spaces(6)}, policies={"a": "shared"}, sides={"a": ("a",)})
     for location in ("../secret", str(tmp_path / "secret"), "link"):
         graph = model([])
-        weight = next(each for each in graph.graph.initializer if each.name == "w")
+        weight = next(tensor for tensor in graph.graph.initializer if tensor.name == "w")
         weight.ClearField("raw_data")
         weight.data_location = TensorProto.EXTERNAL
         weight.external_data.add(key="location", value=location)
@@ -251,7 +254,6 @@ class Expanding(nn.Module):
 
 
 NETWORKS: dict[str, tuple[nn.Module, tuple[int, ...]]] = {
-    "dense": (nn.Sequential(nn.Flatten(), nn.Linear(84, 16), nn.Tanh(), nn.Linear(16, 5)), (6, 7, 2)),
     "of Atari": (
         nn.Sequential(nn.Conv2d(4, 32, 8, 4), nn.ReLU(), nn.Conv2d(32, 64, 4, 2), nn.ReLU(), nn.Conv2d(64, 64, 3),
                       nn.ReLU(), nn.Flatten(), nn.Linear(3136, 512), nn.ReLU(), nn.Linear(512, 5)),
@@ -293,8 +295,8 @@ def exported(network: nn.Module, shape: tuple[int, ...], opset: int | None) -> M
         return onnx.load_from_string(file.getvalue())
 
 
-QUICK = {("dense", None), ("residual", 17), ("LSTM", None), ("GRU", 17)}
-"""Each exporter, without a memory and with one."""
+QUICK = {("residual", 17), ("GRU", 17)}
+"""Of the exporter that traces TorchScript. Graphs of the other one: `tests/training/export/test_onnx_export.py`."""
 
 
 @pytest.mark.parametrize(

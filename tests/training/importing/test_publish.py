@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -34,6 +35,21 @@ def registry(tmp_path: Path) -> Iterator[Registry]:
     opened.close()
 
 
+@pytest.fixture
+def mapping(tmp_path: Path) -> Path:
+    return tmp_path / "names.yaml"
+
+
+def write_mapping(path: Path, kind: str) -> None:
+    path.write_text(f"inputs: {{planes: observation}}\noutput: policy_head\nkind: {kind}\n")
+
+
+def graph(directory: Path, shape: tuple[int, ...] | None = (3, 3, 2), **options: Any) -> Path:
+    path = directory / "foreign.onnx"
+    path.write_bytes(foreign(18, 9, shape=shape, **options))
+    return path
+
+
 def imported(registry: Registry, path: Path, mapping: Path | None = None) -> VersionRow:
     interface = registry.leagues.get(tictactoe.LEAGUE).interface
     sources, digest = open_sources(path, interface, mapping=mapping)
@@ -41,8 +57,7 @@ def imported(registry: Registry, path: Path, mapping: Path | None = None) -> Ver
 
 
 def test_an_imported_graph_is_a_version_like_others(registry: Registry, tmp_path: Path) -> None:
-    path = tmp_path / "foreign.onnx"
-    path.write_bytes(foreign(18, 9, shape=(3, 3, 2)))
+    path = graph(tmp_path)
     version = imported(registry, path)
     policy = version.manifest.policies["shared"]
     assert (policy.parity.mismatches, policy.parity.observations >= 400) == (0, True)
@@ -55,10 +70,8 @@ def test_an_imported_graph_is_a_version_like_others(registry: Registry, tmp_path
 
 
 def test_training_cannot_start_from_an_imported_version(registry: Registry, tmp_path: Path) -> None:
-    path = tmp_path / "foreign.onnx"
-    path.write_bytes(foreign(18, 9, shape=(3, 3, 2)))
     with pytest.raises(ConfigError, match=r"tictactoe@1 was imported: it has no training state"):
-        check_network(imported(registry, path), tictactoe.config())
+        check_network(imported(registry, graph(tmp_path)), tictactoe.config())
 
 
 def test_weights_in_another_file_are_included(registry: Registry, tmp_path: Path) -> None:
@@ -73,82 +86,72 @@ def test_weights_in_another_file_are_included(registry: Registry, tmp_path: Path
     load(version.ref, registry=registry)
 
 
-def test_a_mapping_file_names_the_tensors(registry: Registry, tmp_path: Path) -> None:
-    path, mapping = tmp_path / "foreign.onnx", tmp_path / "names.yaml"
-    path.write_bytes(foreign(18, 9))
+def test_a_mapping_file_names_the_tensors(registry: Registry, tmp_path: Path, mapping: Path) -> None:
+    path = graph(tmp_path, shape=None)
     with pytest.raises(EnvironmentMismatch, match="mapping file"):
         imported(registry, path)
-    mapping.write_text("inputs: {planes: observation}\noutput: policy_head\nkind: values\n")
+    write_mapping(mapping, "values")
     assert imported(registry, path, mapping).number == 1
 
 
-def test_probabilities_are_not_taken_for_logits(registry: Registry, tmp_path: Path) -> None:
-    path, mapping = tmp_path / "foreign.onnx", tmp_path / "names.yaml"
-    path.write_bytes(foreign(18, 9, shape=(3, 3, 2), kind="probabilities"))
+def test_probabilities_are_not_taken_for_logits(registry: Registry, tmp_path: Path, mapping: Path) -> None:
+    path = graph(tmp_path, kind="probabilities")
     with pytest.raises(ParityError, match=r"policy_head are from 0 to 1 with the sum 1.* `kind: probabilities`"):
         imported(registry, path)
-    mapping.write_text("inputs: {planes: observation}\noutput: policy_head\nkind: probabilities\n")
-    number = imported(registry, path, mapping).number
-    board, legal = np.zeros((1, 3, 3, 2), np.int8), np.ones((1, 9), np.int8)
+    write_mapping(mapping, "probabilities")
+    policy = load(imported(registry, path, mapping).ref, registry=registry)
+    legal = np.ones((1, 9), np.int8)
     legal[0, 0] = 0
-    observation = {"observation": board + 1, "action_mask": legal}
-    dist_inputs = (
-        load(f"tictactoe@{number}", registry=registry)
-        .act(observation, explore=True, rng=[np.random.default_rng(0)])
-        .dist_inputs
-    )
+    observation = {"observation": np.ones((1, 3, 3, 2), np.int8), "action_mask": legal}
+    dist_inputs = policy.act(observation, explore=True, rng=[np.random.default_rng(0)]).dist_inputs
+    assert dist_inputs is not None
     weights = onnx.numpy_helper.to_array(onnx.load_from_string(foreign(18, 9)).graph.initializer[0])
     expected = np.where(legal[0] != 0, np.exp(weights.sum(axis=0)), 0)
     np.testing.assert_allclose(softmax(dist_inputs[0]), expected / expected.sum(), rtol=1e-4)
 
 
-def test_logits_are_not_taken_for_probabilities(registry: Registry, tmp_path: Path) -> None:
-    path, mapping = tmp_path / "foreign.onnx", tmp_path / "names.yaml"
-    path.write_bytes(foreign(18, 9, shape=(3, 3, 2)))
-    mapping.write_text("inputs: {planes: observation}\noutput: policy_head\nkind: probabilities\n")
+def test_logits_are_not_taken_for_probabilities(registry: Registry, tmp_path: Path, mapping: Path) -> None:
+    write_mapping(mapping, "probabilities")
     with pytest.raises(ParityError, match=r"for \d+ of \d+ observations, policy_head is not probabilities: expected"):
-        imported(registry, path, mapping)
+        imported(registry, graph(tmp_path), mapping)
 
 
 def test_illegal_actions_are_refused(registry: Registry, tmp_path: Path) -> None:
-    path = tmp_path / "foreign.onnx"
-    path.write_bytes(foreign(18, 9, shape=(3, 3, 2), kind="action"))
     with pytest.raises(ParityError, match=r"policy shared: action [0-9] is illegal, where action_mask"):
-        imported(registry, path)
+        imported(registry, graph(tmp_path, kind="action"))
     assert registry.versions.all(tictactoe.LEAGUE) == []
 
 
-@pytest.mark.parametrize(
-    ("kind", "problem"),
-    [
-        ("softmax", "computes other .* 256 observations alone than in a batch: its rows influence each other"),
-        ("running_sum", "computes other .* 256 observations alone than in a batch: its rows influence each other"),
-        (
-            "normalized",
-            "computes other outputs for 256 of 256 observations in a second run: as with Dropout or BatchNorm",
-        ),
-        ("ranked", "computes other .* 256 observations alone than in a batch: its rows influence each other"),
-        ("dropout", "greedy actions of the source differ from run to run, as with Dropout"),
-    ],
-)
+OTHER_ROWS = "computes other .* 256 observations alone than in a batch: its rows influence each other"
+SECOND_RUN = "computes other outputs for 256 of 256 observations in a second run: as with Dropout or BatchNorm"
+
+
 def test_a_graph_acts_on_each_observation_by_itself(
-    registry: Registry, tmp_path: Path, kind: str, problem: str
+    registry: Registry, tmp_path: Path, subtests: pytest.Subtests
 ) -> None:
     path = tmp_path / "foreign.onnx"
-    path.write_bytes(influenced(kind))
-    with pytest.raises(ParityError, match=f"policy shared:? {problem}"):
-        imported(registry, path)
+    for kind, problem in (
+        ("softmax", OTHER_ROWS),
+        ("running_sum", OTHER_ROWS),
+        ("normalized", SECOND_RUN),
+        ("ranked", OTHER_ROWS),
+        ("dropout", "greedy actions of the source differ from run to run, as with Dropout"),
+    ):
+        path.write_bytes(influenced(kind))
+        with subtests.test(kind), pytest.raises(ParityError, match=f"policy shared:? {problem}"):
+            imported(registry, path)
     assert registry.versions.all(tictactoe.LEAGUE) == []
 
 
-def test_files_that_cannot_be_read_are_named(registry: Registry, tmp_path: Path, subtests: pytest.Subtests) -> None:
+def test_files_that_cannot_be_read_are_named(
+    registry: Registry, tmp_path: Path, mapping: Path, subtests: pytest.Subtests
+) -> None:
     for name, content in (("graph.onnx", b"text"), ("graph.h5", b"text"), ("a.onnx", b"")):
         (tmp_path / name).write_bytes(content)
         with subtests.test(name), pytest.raises(ConfigError, match=name):
             imported(registry, tmp_path / name)
-    path, mapping = tmp_path / "foreign.onnx", tmp_path / "names.yaml"
-    path.write_bytes(foreign(18, 9))
-    for text in ("[" * 5000, "kind: " + "1" * 5000, "2024-13-45: 1", "a: &a [*a]", "\x00", "{inputs: {planes: [1]}}"):
+    path = graph(tmp_path, shape=None)
+    for text in ("[" * 1000, "kind: " + "1" * 5000, "2024-13-45: 1", "a: &a [*a]", "\x00", "{inputs: {planes: [1]}}"):
         mapping.write_text(text)
         with subtests.test(text[:20]), pytest.raises(ConfigError, match=r"names\.yaml: [^\n]+$"):
             imported(registry, path, mapping)

@@ -1,6 +1,7 @@
 """The learner alone, on joint transitions sampled by a runner in this process."""
 
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +14,12 @@ from league.environments.building import interface
 from tests.support.leagues.training_leagues import maddpg
 from training.algorithms.rllib_config import algorithm_config
 from training.learners.maddpg import AgentSlot, MADDPGLearner, critic_loss, critic_name
-from training.learners.off_policy import bootstrapped_returns
 from training.replay_buffer import ReplayBuffer, Sample
 from training.sampling.closed_transitions import JOINT
 from training.sampling.replay_runner import ActorRunner
 
 OWN = {"a": ["player_0"], "b": ["player_1"]}
 GAMMA = 0.95
-
-pytestmark = pytest.mark.usefixtures("ray_session")
 
 
 def learner_of(league: LeagueConfig) -> MADDPGLearner:
@@ -71,16 +69,14 @@ def test_targets_follow_equation_6_and_bootstrap_truncated_agents() -> None:
     order = [learner._critic_agents(AgentSlot("a", 0))]
     targets = learner._targets("a", batch, order)
     stays = rows["present/b"] & ~rows["terminated/b"]
-    seen = [{"observation": rows[f"next_observations/{agent}/observation"][:, 0]} for agent in "ab"]
-    acts = [learner.targets[agent].act(o, 1.0)[0] for agent, o in zip("ab", seen, strict=True)]
-    following = learner.targets[critic_name("a")](seen, [acts[0], acts[1] * stays])
+    observations = [{"observation": rows[f"next_observations/{agent}/observation"][:, 0]} for agent in "ab"]
+    acts = [learner.targets[agent].act(part, 1.0)[0] for agent, part in zip("ab", observations, strict=True)]
+    following = learner.targets[critic_name("a")](observations, [acts[0], acts[1] * stays])
     assert torch.allclose(targets, rows["rewards/a"][:, 0] + GAMMA * following)
-    cut = bootstrapped_returns(rows["rewards/a"][:, 0], rows["discounts"], rows["truncated/a"][:, 0], following)
-    assert not torch.allclose(targets, cut), "treating truncation as termination has no effect"
-    own = learner._targets("b", batch, [learner._critic_agents(AgentSlot("b", 0))])
+    of_second = learner._targets("b", batch, [learner._critic_agents(AgentSlot("b", 0))])
     ended = rows["terminated/b"][:, 0]
     # There is no bootstrap after termination.
-    torch.testing.assert_close(own[ended], rows["rewards/b"][:, 0][ended])
+    torch.testing.assert_close(of_second[ended], rows["rewards/b"][:, 0][ended])
 
 
 def test_a_restored_learner_has_the_learning_rate_of_its_own_settings(tmp_path: Path) -> None:
@@ -107,10 +103,10 @@ def test_each_network_has_its_own_optimizer_and_loss(critic: str) -> None:
     assert moved == {"a", "a.critic"}, "frozen policies and their critics do not change"
     rows = learner.batch(sample).rows
     order = [learner._critic_agents(AgentSlot("a", 0))]
-    seen, done = learner._critic_inputs(rows, order)
+    observations, actions = learner._critic_inputs(rows, order)
     for name, loss in (
-        ("a.critic", critic_loss(learner.networks["a.critic"](seen, done), torch.zeros(len(done[0])))),
-        ("a", learner.policy_loss("a", seen, done, torch.ones(len(done[0])))),
+        ("a.critic", critic_loss(learner.networks["a.critic"](observations, actions), torch.zeros(len(actions[0])))),
+        ("a", learner.policy_loss("a", observations, actions, torch.ones(len(actions[0])))),
     ):
         before = {key: weights(network) for key, network in learner.networks.items()}
         learner.gradient_step(loss, [name])
@@ -120,29 +116,33 @@ def test_each_network_has_its_own_optimizer_and_loss(critic: str) -> None:
 def test_an_actor_step_increases_the_value_of_its_critic() -> None:
     league = maddpg("summing", {}, OWN, lr=0.001, regularization=0)
     learner, sample = learner_of(league), sample_transitions(league)
-    seen, done = learner._critic_inputs(learner.batch(sample).rows, [learner._critic_agents(AgentSlot("a", 0))])
-    everyone = torch.ones(len(done[0]))
+    observations, actions = learner._critic_inputs(
+        learner.batch(sample).rows, [learner._critic_agents(AgentSlot("a", 0))]
+    )
+    everyone = torch.ones(len(actions[0]))
     losses = []
     for _ in range(10):
-        loss = learner.policy_loss("a", seen, done, everyone)
+        loss = learner.policy_loss("a", observations, actions, everyone)
         losses.append(loss.item())
         learner.gradient_step(loss, ["a"])
     assert all(after < before for before, after in itertools.pairwise(losses)), losses
 
 
+def learned(league: LeagueConfig, sample: Sample, learning: Sequence[str]) -> list[torch.Tensor]:
+    """The weights of all networks of a new learner after a step."""
+    learner = learner_of(league)
+    learner.learn({JOINT: sample}, learning)
+    return [parameter for network in learner.networks.values() for parameter in weights(network)]
+
+
 def test_independent_critics_ignore_other_agents() -> None:
-    league = maddpg("summing", {}, OWN)
-    sample = sample_transitions(league)
+    sample = sample_transitions(maddpg("summing", {}, OWN))
     other = Sample(dict(sample.rows), sample.indices, sample.weights)
     for name in ("observations/b/observation", "actions/b", "next_observations/b/observation"):
         other.rows[name] = other.rows[name] + np.float32(1)
     for critic, differs in (("own", False), ("centralised", True)):
-        results = []
-        for given in (sample, other):
-            learner = learner_of(maddpg("summing", {}, OWN, critic=critic))
-            learner.learn({JOINT: given}, ["a"])
-            results.append(weights(learner.networks["a"]) + weights(learner.networks["a.critic"]))
-        assert are_equal(*results) != differs
+        league = maddpg("summing", {}, OWN, critic=critic)
+        assert are_equal(*(learned(league, part, ["a"]) for part in (sample, other))) != differs
 
 
 def test_rows_of_absent_agents_are_ignored() -> None:
@@ -153,12 +153,7 @@ def test_rows_of_absent_agents_are_ignored() -> None:
     other = Sample({name: column.copy() for name, column in sample.rows.items()}, sample.indices, sample.weights)
     for name in ("actions/b", "rewards/b"):
         other.rows[name][absent] = 9.0
-    results = []
-    for given in (sample, other):
-        learner = learner_of(league)
-        learner.learn({JOINT: twice(given)}, ["a", "b"])
-        results.append([parameter for network in learner.networks.values() for parameter in weights(network)])
-    assert are_equal(*results)
+    assert are_equal(*(learned(league, twice(part), ["a", "b"]) for part in (sample, other)))
 
 
 def test_agents_that_share_a_policy_are_first_in_turn() -> None:
@@ -172,14 +167,16 @@ def test_agents_that_share_a_policy_are_first_in_turn() -> None:
     ]
     sample = sample_transitions(maddpg("discrete", {"agents": 3}, policies))
     rows = learner.batch(sample).rows
-    seen, done = learner._critic_inputs(rows, [learner._critic_agents(first), learner._critic_agents(second)])
+    observations, actions = learner._critic_inputs(
+        rows, [learner._critic_agents(first), learner._critic_agents(second)]
+    )
     k = len(sample.indices)
     tasks = rows["observations/pair/observation"]
-    assert torch.equal(seen[0]["observation"], torch.cat([tasks[:, 0], tasks[:, 1]]))
-    assert torch.equal(seen[1]["observation"], torch.cat([tasks[:, 1], tasks[:, 0]]))
-    assert torch.equal(seen[2]["observation"], rows["observations/single/observation"][:, 0].repeat(2))
-    assert torch.equal(done[0][:k].argmax(-1), rows["actions/pair"][:, 0])
-    assert torch.equal(done[0][k:].argmax(-1), rows["actions/pair"][:, 1])
+    assert torch.equal(observations[0]["observation"], torch.cat([tasks[:, 0], tasks[:, 1]]))
+    assert torch.equal(observations[1]["observation"], torch.cat([tasks[:, 1], tasks[:, 0]]))
+    assert torch.equal(observations[2]["observation"], rows["observations/single/observation"][:, 0].repeat(2))
+    assert torch.equal(actions[0][:k].argmax(-1), rows["actions/pair"][:, 0])
+    assert torch.equal(actions[0][k:].argmax(-1), rows["actions/pair"][:, 1])
     errors = learner.learn({JOINT: twice(sample)}, ["pair", "single"])
     assert errors[JOINT].shape == (2 * k,)
 
@@ -201,7 +198,6 @@ def test_running_statistics_reach_actors_critics_and_targets() -> None:
     learner.learn({JOINT: twice(sample)}, ["a", "b"])
     mean = sample.rows["observations/a/observation"].mean()
     for network in (*learner.networks.values(), *learner.targets.values()):
-        found = dict(network.named_buffers())
-        assert any(name.endswith("mean") for name in found)
-    (own,) = (b for n, b in learner.targets["a"].named_buffers() if n.endswith("mean"))
-    assert float(own) == pytest.approx(float(mean), abs=1e-5)
+        assert any(name.endswith("mean") for name, _ in network.named_buffers())
+    (statistic,) = (buffer for name, buffer in learner.targets["a"].named_buffers() if name.endswith("mean"))
+    assert float(statistic) == pytest.approx(float(mean), abs=1e-5)

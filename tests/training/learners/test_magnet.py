@@ -1,13 +1,10 @@
-"""The reference policies of the magnet, and its term of the loss."""
+"""The reference policies of the magnet. Its term of the loss: `test_ppo_loss.py`."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from league.environments.building import interface
 from league.errors import ConfigError
@@ -17,33 +14,10 @@ from tests.support.leagues.training_leagues import solvable
 from tests.support.learners import episodes_of, learner_of, update
 from training.algorithms.rllib_config import algorithm_config
 from training.learners.magnet import Uniform, magnet
-from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT, ppo_loss
-from training.learners.train_batch import Minibatch, TrainBatch, train_batch
+from training.learners.ppo import MAGNET_KL, MAGNET_WEIGHT
+from training.learners.train_batch import TrainBatch, train_batch
 from training.modules.distributions import TorchCategorical
 from training.modules.policy_module import MASKED_LOGIT
-
-pytestmark = pytest.mark.usefixtures("ray_session")
-
-
-def minibatch(old: Tensor, reference: Tensor) -> Minibatch:
-    rows = len(old)
-    return Minibatch({}, torch.zeros(rows, dtype=torch.int64), old, torch.zeros(rows), *torch.zeros(2, rows), reference)
-
-
-def test_the_loss_contains_the_weighted_divergence_from_the_reference() -> None:
-    torch.manual_seed(0)
-    inputs, reference = torch.randn(2, 30, 3).unbind()
-    p, q = torch.softmax(inputs, -1), torch.softmax(reference, -1)
-    options = {"clip": 0.2, "entropy": 0.1, "value_loss": 0.5}
-
-    def loss(steps: Minibatch, **magnet: float) -> Any:
-        return ppo_loss(steps, inputs, torch.zeros(30), TorchCategorical(3), **options, **magnet)
-
-    pulled = loss(minibatch(inputs, reference), magnet=0.7)
-    free = loss(replace(minibatch(inputs, reference), magnet=None))
-    expected = (p * (p / q).log()).sum(-1).mean()
-    assert pulled.magnet_kl.item() == pytest.approx(expected.item(), rel=1e-5)
-    assert free.magnet_kl is None
 
 
 def test_the_divergence_from_uniform_is_the_missing_entropy_of_legal_actions() -> None:
@@ -63,7 +37,7 @@ def test_previous_is_refreshed_and_its_divergence_is_reported() -> None:
     learner, episodes = learner_of(league), episodes_of(league)
     snapshots, divergences = [], []
     for _ in range(3):
-        divergences.append(update(learner, episodes)[MAGNET_KL])
+        divergences.append(update(learner, episodes)["shared"][MAGNET_KL])
         snapshots.append(learner.get_state()["magnet"])
     torch.testing.assert_close(snapshots[0], snapshots[1])
     changed = [not np.array_equal(first, second) for first, second in zip(*map(arrays, snapshots[1:]), strict=True)]
@@ -83,9 +57,9 @@ def test_a_restored_learner_has_the_same_snapshot(tmp_path: Path) -> None:
     restored = learner_of(league.with_training(seed=8))
     restored.restore_from_path(tmp_path / "state")
     results = []
-    for each in (learner, restored):
+    for continued in (learner, restored):
         torch.manual_seed(1)
-        results.append((update(each, episodes)[MAGNET_KL], *arrays(each.get_state()["magnet"])))
+        results.append((update(continued, episodes)["shared"][MAGNET_KL], *arrays(continued.get_state()["magnet"])))
     for first, second in zip(*results, strict=True):
         np.testing.assert_array_equal(first, second)
 
@@ -105,24 +79,27 @@ def test_a_run_that_continues_one_without_a_magnet_starts_from_its_policy(tmp_pa
 def test_metrics_contain_the_weight_only_if_it_is_scheduled() -> None:
     league = solvable("discrete", magnet={"ref": "uniform", "weight": {"initial": 0.2, "final": 0.1}})
     episodes = episodes_of(league)
-    assert update(learner_of(league), episodes)[MAGNET_WEIGHT] == pytest.approx(0.2)
-    constant = update(learner_of(league.with_training(magnet={"ref": "uniform", "weight": 0.2})), episodes)
-    assert MAGNET_WEIGHT not in constant
-    assert MAGNET_KL in constant
-    assert MAGNET_KL not in update(learner_of(league.with_training(magnet=None)), episodes)
+    constant = league.with_training(magnet={"ref": "uniform", "weight": 0.2})
+    scheduled, unscheduled, free = (
+        update(learner_of(config), episodes)["shared"]
+        for config in (league, constant, league.with_training(magnet=None))
+    )
+    assert scheduled[MAGNET_WEIGHT] == pytest.approx(0.2)
+    assert {MAGNET_WEIGHT, MAGNET_KL} & unscheduled.keys() == {MAGNET_KL}
+    assert MAGNET_KL not in free
 
 
 def test_a_strong_magnet_keeps_the_policy_near_the_reference() -> None:
     league = solvable("discrete", magnet={"ref": "uniform", "weight": 0.0})
-    found = []
+    divergences = []
     for weight in (0.0, 3.0):
         learner = learner_of(league.with_training(magnet={"ref": "uniform", "weight": weight}))
         torch.manual_seed(0)
         episodes = episodes_of(league)
         for _ in range(5):
-            last = update(learner, episodes)[MAGNET_KL]
-        found.append(last)
-    assert found[1] < found[0] / 2
+            last = update(learner, episodes)["shared"][MAGNET_KL]
+        divergences.append(last)
+    assert divergences[1] < divergences[0] / 2
 
 
 def test_a_version_is_a_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,11 +114,11 @@ def test_a_version_is_a_reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     episodes = episodes_of(league)
     batch = train_batch(learner.module["shared"], episodes, gamma=1.0, lambda_=1.0)
     assert learner._magnet is not None
-    found = learner._magnet.dist_inputs("shared", batch)
+    dist_inputs = learner._magnet.dist_inputs("shared", batch)
     rows = {name: value[batch.acted].numpy() for name, value in batch.observations.items()}
-    assert len(found) > 20
-    np.testing.assert_allclose(found.numpy(), OnnxPolicy(graph).distribution(rows).dist_inputs, rtol=1e-5)
-    assert update(learner, episodes)[MAGNET_KL] > 0
+    assert len(dist_inputs) > 20
+    np.testing.assert_allclose(dist_inputs.numpy(), OnnxPolicy(graph).distribution(rows).dist_inputs, rtol=1e-5)
+    assert update(learner, episodes)["shared"][MAGNET_KL] > 0
 
 
 def test_unsuitable_references_are_rejected(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from league.config.league import LeagueConfig
-from league.environments.building import interface
+from tests.support.algorithms import running
 from tests.support.leagues.training_leagues import maddpg, solvable_by_dqn
-from training.algorithms.off_policy import OffPolicy
+from training.algorithms import off_policy
 from training.replay_buffer import Sample
-from training.runs.trial import build_algorithm
 
-pytestmark = pytest.mark.usefixtures("ray_session")
 MEMORY = {"recurrence": {"width": 8, "sequence": 3}}
 NORMAL = {"normalize_observations": True}
 PAIR = {"a": ["player_0"], "b": ["player_1"]}
@@ -37,20 +34,18 @@ LEAGUES: dict[str, Callable[[], LeagueConfig]] = {
 }
 
 
-@contextmanager
-def with_replay(league: LeagueConfig) -> Iterator[OffPolicy]:
-    """Yields an algorithm whose buffers are filled, and which has taken some gradient steps."""
-    algorithm = build_algorithm(league, interface(league))
-    try:
-        algorithm.reset_episodes(0)
-        while not algorithm._learner.updates:
-            algorithm.train()
-        yield algorithm
-    finally:
-        algorithm.stop()
+@pytest.fixture(scope="module")
+def algorithm(request: pytest.FixtureRequest, ray_session: None) -> Iterator[Any]:
+    """Its buffers are filled, and it has taken some gradient steps."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(off_policy, "ITERATION_STEPS", 256)
+        with running(LEAGUES[request.param]().with_training(learning_starts=64)) as algorithm:
+            while not algorithm._learner.updates:
+                algorithm.train()
+            yield algorithm
 
 
-def samples(algorithm: OffPolicy, steps: int) -> tuple[tuple[str, ...], dict[str, Sample]]:
+def samples(algorithm: Any, steps: int) -> tuple[tuple[str, ...], dict[str, Sample]]:
     learning = tuple(algorithm.config.policies)
     draws = steps * algorithm.draws_per_step(learning)
     return learning, {key: algorithm.draw_sample(replay, draws) for key, replay in algorithm.replays.items()}
@@ -61,33 +56,34 @@ def part(sample: Sample, number: int, parts: int) -> Sample:
     return Sample(rows, np.split(sample.indices, parts)[number], np.split(sample.weights, parts)[number])
 
 
-@pytest.mark.parametrize("name", ["dqn, noisy and distributional", "qmix, recurrent", "maddpg, discrete"])
-def test_several_steps_equal_single_ones(name: str) -> None:
-    with with_replay(LEAGUES[name]()) as algorithm:
-        learner = algorithm._learner
-        state = copy.deepcopy(learner.get_state())
-        # Otherwise, RLlib keeps the weights that it has, as newer ones.
-        del state[WEIGHTS_SEQ_NO]
-        learning, drawn = samples(algorithm, 3)
+@pytest.mark.parametrize(
+    "algorithm", ["dqn, noisy and distributional", "qmix, recurrent", "maddpg, discrete"], indirect=True
+)
+def test_several_steps_equal_single_ones(algorithm: Any) -> None:
+    learner = algorithm._learner
+    state = copy.deepcopy(learner.get_state())
+    # Otherwise, RLlib keeps the weights that it has, as newer ones.
+    del state[WEIGHTS_SEQ_NO]
+    learning, drawn = samples(algorithm, 3)
 
-        def learned(learn: Callable[[], Any]) -> dict[str, torch.Tensor]:
-            learner.set_state(copy.deepcopy(state))
-            torch.manual_seed(0)
-            learn()
-            networks = learner.networks | {f"target of {key}": target for key, target in learner.targets.items()}
-            return {
-                f"{key}.{parameter}": value.clone()
-                for key, network in networks.items()
-                for parameter, value in network.state_dict().items()
-            }
+    def learned(learn: Callable[[], Any]) -> dict[str, torch.Tensor]:
+        learner.set_state(copy.deepcopy(state))
+        torch.manual_seed(0)
+        learn()
+        networks = learner.networks | {f"target of {key}": target for key, target in learner.targets.items()}
+        return {
+            f"{key}.{parameter}": value.clone()
+            for key, network in networks.items()
+            for parameter, value in network.state_dict().items()
+        }
 
-        def learn_singly() -> None:
-            for number in range(3):
-                learner.learn({key: part(sample, number, 3) for key, sample in drawn.items()}, learning)
+    def learn_singly() -> None:
+        for number in range(3):
+            learner.learn({key: part(sample, number, 3) for key, sample in drawn.items()}, learning)
 
-        at_once = learned(lambda: learner.learn(drawn, learning, 3))
-        singly = learned(learn_singly)
-        before = learned(lambda: None)
+    at_once = learned(lambda: learner.learn(drawn, learning, 3))
+    singly = learned(learn_singly)
+    before = learned(lambda: None)
     assert all(torch.equal(value, singly[key]) for key, value in at_once.items())
     assert any(not torch.equal(value, before[key]) for key, value in at_once.items())
 
@@ -123,34 +119,29 @@ class NeverWaits(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("name", LEAGUES)
-def test_a_step_never_waits_for_a_gpu(name: str) -> None:
-    with with_replay(LEAGUES[name]()) as algorithm:
-        learning, drawn = samples(algorithm, 1)
-        learner = algorithm._learner
-        batches = {key: learner.batch(sample) for key, sample in drawn.items()}
-        updates = learner.updates
-        with NeverWaits():
-            learner.step(batches, learning)
-            learner.update_targets()
-        assert learner.updates == updates + 1
-        assert learner.results()
+@pytest.mark.parametrize("algorithm", LEAGUES, indirect=True)
+def test_a_step_never_waits_for_a_gpu(algorithm: Any) -> None:
+    learning, drawn = samples(algorithm, 1)
+    learner = algorithm._learner
+    batches = {key: learner.batch(sample) for key, sample in drawn.items()}
+    updates = learner.updates
+    with NeverWaits():
+        learner.step(batches, learning)
+        learner.update_targets()
+    assert learner.updates == updates + 1
+    assert learner.results()
 
 
-@pytest.mark.parametrize(
-    "operation",
-    [
-        lambda x: x.sum().item(),
-        lambda x: bool((x > 0).any()),
-        lambda x: x[x > 0],
-        lambda x: x[:, [0, 1]],
-        lambda x: x[torch.arange(2)],
-        lambda x: x.clamp(torch.zeros(4)),
-        lambda x: torch.as_tensor([1.0, 2.0]) * x[:, :2],
-    ],
-    ids=["item", "bool", "mask", "list", "arange", "bound", "constant"],
-)
-def test_the_check_detects_waiting(operation: Callable[[torch.Tensor], Any]) -> None:
-    x = torch.ones(3, 4)
-    with pytest.raises((AssertionError, RuntimeError)), NeverWaits():
-        operation(x)
+def test_the_check_detects_waiting(subtests: pytest.Subtests) -> None:
+    operations: dict[str, Callable[[torch.Tensor], Any]] = {
+        "item": lambda x: x.sum().item(),
+        "bool": lambda x: bool((x > 0).any()),
+        "mask": lambda x: x[x > 0],
+        "list": lambda x: x[:, [0, 1]],
+        "arange": lambda x: x[torch.arange(2)],
+        "bound": lambda x: x.clamp(torch.zeros(4)),
+        "constant": lambda x: torch.as_tensor([1.0, 2.0]) * x[:, :2],
+    }
+    for name, operation in operations.items():
+        with subtests.test(name), pytest.raises((AssertionError, RuntimeError)), NeverWaits():
+            operation(torch.ones(3, 4, device="cpu"))

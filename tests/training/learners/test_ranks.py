@@ -1,35 +1,29 @@
-"""Two learners in two processes, on the same sample: an update equals that of one learner."""
+"""Two learners on the same sample: an update equals that of one learner."""
 
-import multiprocessing
-from collections.abc import Iterator
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from multiprocessing.connection import Connection
+from threading import Semaphore
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from league.config.league import LeagueConfig
-from tests.support.leagues.training_leagues import counting, solvable, tictactoe
-from tests.support.learners import episodes_of, learner_of
-from training.learners.ppo import PPOLearner
+from tests.support.closeness import close
+from tests.support.leagues.training_leagues import counting, small, solvable, tictactoe
+from tests.support.learners import episodes_of, equal, learner_of, update, weights
 from training.learners.ranks import Rank, TCPStore, connect
-from training.rllib_compat import TrainingData
 from training.sampling.episode_chunks import EpisodeChunks
 
-CONNECT_FOUR = {
-    "league": "connect_four",
-    "environment": {"entry_point": "pettingzoo.classic.connect_four_v3"},
-    "training": {"runners": 0, "num_envs": 8, "convolutions": [{"filters": 8, "kernel": 4}], "hidden": [16]},
-}
 TWO: dict[str, Any] = {"kwargs": {"agents": 2}, "policies": {"a": ["player_0"], "b": ["player_1"]}}
 LEAGUES = {
     "an MLP": tictactoe(),
-    "convolutions": LeagueConfig.from_mapping(CONNECT_FOUR),
+    "convolutions": small("pettingzoo.classic.connect_four_v3", convolutions=[{"filters": 8, "kernel": 4}]),
     "a recurrent policy": solvable("remembering", recurrence={"width": 16, "sequence": 8}),
     "a shared encoder": solvable("discrete", **TWO, shared_encoder=True),
     "normalised observations": solvable("far_numbers", normalize_observations=True),
@@ -40,84 +34,95 @@ LEAGUES = {
 UPDATES = 2
 
 
-def updates(league: LeagueConfig, episodes: list[EpisodeChunks], rank: Rank) -> tuple[dict, dict, dict]:
-    """Return metrics, weights and the optimisers' state of a learner after some updates."""
+Learned = tuple[dict[str, dict[str, float]], dict[str, Any], list[NDArray]]
+"""Metrics, weights and the optimisers' states."""
+
+
+def learned(league: LeagueConfig, episodes: list[EpisodeChunks], rank: Rank) -> Learned:
+    """After some updates."""
     torch.manual_seed(7)
     learner = learner_of(league)
     learner.rank = rank
-    data = TrainingData(episodes=episodes)
-    with patch("training.learners.ppo.fast_products", nullcontext):  # bfloat16 rounds sums of other rows differently
-        for _ in range(UPDATES):
-            metrics = learner.update(training_data=data, num_epochs=2, minibatch_size=64)
-    optimizers = {
-        f"{name} {place} {key}": value
-        for name, optimizer in learner._optimizers.items()
-        for place, state in optimizer.state_dict()["state"].items()
-        for key, value in state.items()
-    }
-    logged = {f"{policy} {name}": float(stats.peek()) for policy, row in metrics.items() for name, stats in row.items()}
-    return logged, weights(learner), {name: value.numpy() for name, value in optimizers.items()}
+    for _ in range(UPDATES):
+        metrics = update(learner, episodes)
+    states = [optimizer.state_dict()["state"] for optimizer in learner._optimizers.values()]
+    moments = [value.numpy() for state in states for parameter in state.values() for value in parameter.values()]
+    return metrics, weights(learner), moments
 
 
-def weights(learner: PPOLearner) -> dict[str, np.ndarray]:
-    return {
-        f"{policy} {name}": array
-        for policy, module in learner.module.items()
-        for name, array in module.get_state().items()
-    }
+class TwoLearners:
+    """Two learners that take turns in this process: each computes until both have a part of a sum."""
+
+    def __init__(self) -> None:
+        self.turns = Semaphore(1), Semaphore(0)
+        self.parts: list[torch.Tensor] = []
+        self.of_thread = threading.local()
+
+    def all_reduce(self, part: torch.Tensor) -> None:
+        self.parts.append(part)
+        if len(self.parts) == 2:
+            total = torch.stack(self.parts).sum(dim=0)
+            for summand in self.parts:
+                summand.copy_(total)
+            self.parts.clear()
+        random_state = torch.get_rng_state()
+        self.turns[1 - self.of_thread.index].release()
+        assert self.turns[self.of_thread.index].acquire(timeout=60)
+        torch.set_rng_state(random_state)
+
+    def learned(self, league: LeagueConfig, episodes: list[EpisodeChunks]) -> list[Learned]:
+        def learn(index: int) -> Learned:
+            torch.set_num_threads(1)
+            self.of_thread.index = index
+            assert self.turns[index].acquire(timeout=60)
+            try:
+                return learned(league, episodes, Rank(index, 2))
+            finally:
+                self.turns[1 - index].release()
+
+        with ThreadPoolExecutor(2) as threads:
+            return list(threads.map(learn, range(2)))
 
 
-def second_learner(pipe: Connection, port: int) -> None:
-    """The other process: updates a learner on each sample from the pipe, and answers with its state."""
-    torch.set_num_threads(1)
-    rank = Rank(1, 2)
-    connect(rank, TCPStore("127.0.0.1", port, 2), "gloo")
-    while (sample := pipe.recv()) is not None:
-        pipe.send(updates(*sample, rank))
-
-
-@pytest.fixture(scope="module")
-def second() -> Iterator[Connection]:
-    store = TCPStore("127.0.0.1", 0, 2, is_master=True, wait_for_workers=False)
-    here, there = multiprocessing.Pipe()
-    process = multiprocessing.get_context("spawn").Process(target=second_learner, args=(there, store.port), daemon=True)
-    process.start()
-    connect(Rank(0, 2), store, "gloo")
-    yield here
-    torch.distributed.destroy_process_group()
-    here.send(None)
-    process.join()
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> TwoLearners:
+    learners = TwoLearners()
+    monkeypatch.setattr("training.learners.ppo.fast_products", nullcontext)  # bfloat16 rounds sums differently
+    monkeypatch.setattr(torch.distributed, "all_reduce", learners.all_reduce)
+    return learners
 
 
 @pytest.mark.parametrize("name", LEAGUES)
-def test_an_update_of_two_learners_equals_that_of_one(name: str, second: Connection) -> None:
+def test_an_update_of_two_learners_equals_that_of_one(name: str, two: TwoLearners) -> None:
     league = LEAGUES[name]
     episodes = episodes_of(league)
-    expected_metrics, expected_weights, _ = updates(league, episodes, Rank())
-    second.send((league, episodes))
-    metrics, first_weights, moments = updates(league, episodes, Rank(0, 2))
-    other_metrics, other_weights, other_moments = second.recv()
-    assert metrics == pytest.approx(expected_metrics, rel=1e-3, abs=1e-4)
-    for name, array in expected_weights.items():
-        assert first_weights[name] == pytest.approx(array, rel=1e-4, abs=1e-5)
-    assert metrics == other_metrics
-    for mine, theirs in ((first_weights, other_weights), (moments, other_moments)):
-        assert mine.keys() == theirs.keys()
-        assert all(np.array_equal(mine[name], theirs[name]) for name in mine)
+    expected_metrics, expected_weights, _ = learned(league, episodes, Rank())
+    (metrics, first_weights, moments), other = two.learned(league, episodes)
+    for policy, row in expected_metrics.items():
+        assert metrics[policy] == pytest.approx(row, rel=1e-3, abs=1e-4)
+        assert close(first_weights[policy], expected_weights[policy], 1e-4)
+    assert equal((metrics, first_weights, moments), other)
 
 
-def test_a_gradient_that_is_not_finite_for_one_learner_is_skipped_by_both(second: Connection) -> None:
+def test_a_gradient_that_is_not_finite_for_one_learner_is_skipped_by_both(two: TwoLearners) -> None:
     league = LEAGUES["an MLP"]
     (episodes,) = episodes_of(league)
     episodes.log_p[0] = np.nan
+    torch.manual_seed(7)
     before = weights(learner_of(league))
-    second.send((league, [episodes]))
-    _, first_weights, moments = updates(league, [episodes], Rank(0, 2))
-    _, other_weights, other_moments = second.recv()
-    assert any(not np.array_equal(before[name], first_weights[name]) for name in before), "most minibatches are finite"
-    assert all(np.isfinite(array).all() for array in first_weights.values())
-    assert all(np.array_equal(first_weights[name], other_weights[name]) for name in before)
-    assert all(np.array_equal(moments[name], other_moments[name]) for name in moments)
+    (_, first_weights, moments), (_, other_weights, other_moments) = two.learned(league, [episodes])
+    assert not equal(before, first_weights), "most minibatches are finite"
+    assert all(np.isfinite(array).all() for array in first_weights["shared"].values())
+    assert equal((first_weights, moments), (other_weights, other_moments))
+
+
+def test_learners_are_connected_by_the_store_of_the_first() -> None:
+    connect(Rank(0, 1), TCPStore("127.0.0.1", 0, 1, is_master=True), "gloo")
+    try:
+        assert (torch.distributed.get_rank(), torch.distributed.get_world_size()) == (0, 1)
+        assert torch.distributed.get_backend() == "gloo"
+    finally:
+        torch.distributed.destroy_process_group()
 
 
 @given(st.integers(1, 40), st.integers(1, 6), st.booleans())

@@ -59,17 +59,16 @@ def chunk(
     terminated: bool = False,
     truncated: bool = False,
 ) -> EpisodeChunks:
-    """A single chunk."""
     n = len(rewards)
     dtype = np.float32 if isinstance(observations[0], float) else np.int64
-    seen = np.array(observations, dtype)
+    column = np.array(observations, dtype)
     return EpisodeChunks(
         name="chunk",
         policy="a",
         agents=np.zeros(1, np.int64),
         started=np.zeros(1, np.int64),
         lengths=np.array([n]),
-        observations={"observation": seen[:, None] if dtype == np.float32 else seen},
+        observations={"observation": column[:, None] if dtype == np.float32 else column},
         actions=np.arange(n),
         log_p=np.zeros(n, np.float32),
         dist_inputs=np.zeros((n, 2), np.float32),
@@ -81,24 +80,22 @@ def chunk(
 
 
 def step_observations(batch: TrainBatch) -> list[float]:
-    """The observations of the steps."""
     return batch.observations["observation"][batch.acted].flatten().tolist()
 
 
 @pytest.mark.parametrize(
     ("end", "target"),
     [({"terminated": True}, 1.0), ({"truncated": True}, 1.0 + GAMMA * 8.0), ({}, 1.0 + GAMMA * 8.0)],
-    ids=["terminated", "truncated", "cut"],
 )
 def test_the_last_value_is_used_unless_the_agent_terminated(
     identity: Identity, end: dict[str, bool], target: float
 ) -> None:
     """One-step targets, λ = 0; consecutive chunks are independent."""
     chunks = [chunk([2.0, 4.0, 8.0], [0.0, 1.0], **end), chunk([16.0, 32.0], [3.0])]
-    found = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0)
-    assert found.targets.tolist() == pytest.approx([GAMMA * 4.0, target, 3.0 + GAMMA * 32.0])
-    assert step_observations(found) == [2.0, 4.0, 16.0]
-    assert found.actions.tolist() == [0, 1, 0]
+    result = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0)
+    assert result.targets.tolist() == pytest.approx([GAMMA * 4.0, target, 3.0 + GAMMA * 32.0])
+    assert step_observations(result) == [2.0, 4.0, 16.0]
+    assert result.actions.tolist() == [0, 1, 0]
 
 
 def test_bootstrapping_can_be_configured(identity: Identity) -> None:
@@ -108,30 +105,30 @@ def test_bootstrapping_can_be_configured(identity: Identity) -> None:
         return ~(chunks.terminated | chunks.truncated)
 
     chunks = [chunk([2.0, 4.0], [1.0], truncated=True), chunk([2.0, 4.0], [1.0])]
-    found = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0, bootstraps=unless_over)
-    assert found.targets.tolist() == pytest.approx([1.0, 1.0 + GAMMA * 4.0])
+    result = train_batch(identity, chunks, gamma=GAMMA, lambda_=0.0, bootstraps=unless_over)
+    assert result.targets.tolist() == pytest.approx([1.0, 1.0 + GAMMA * 4.0])
 
 
 def test_advantages_are_standardized_and_targets_are_not(identity: Identity) -> None:
     chunks = [chunk([0.0, 1.0, 2.0, 3.0], [1.0, -1.0, 5.0], terminated=True)]
-    found = train_batch(identity, chunks, gamma=GAMMA, lambda_=LAMBDA)
+    result = train_batch(identity, chunks, gamma=GAMMA, lambda_=LAMBDA)
     advantages = generalized_advantages(
         np.array([1.0, -1.0, 5.0]), np.arange(3.0), np.array([1.0, 2.0, 0.0]), np.array([0, 0, 1]), GAMMA, LAMBDA
     )
-    np.testing.assert_allclose(found.targets, advantages + np.arange(3), rtol=1e-6)
-    np.testing.assert_allclose(found.advantages, (advantages - advantages.mean()) / advantages.std(), rtol=1e-5)
-    targets = found.targets.numpy()
-    assert found.explained_variance == pytest.approx(1 - np.var(targets - np.arange(3)) / np.var(targets))
+    np.testing.assert_allclose(result.targets, advantages + np.arange(3), rtol=1e-6)
+    np.testing.assert_allclose(result.advantages, (advantages - advantages.mean()) / advantages.std(), rtol=1e-5)
+    targets = result.targets.numpy()
+    assert result.explained_variance == pytest.approx(1 - np.var(targets - np.arange(3)) / np.var(targets))
 
 
 def test_statistics_are_updated_before_values_are_computed() -> None:
     net = network(spaces.Box(-np.inf, np.inf, (1,)), normalize=True)
     chunks = [chunk([1000.0, 1002.0, 1004.0], [0.0, 0.0])]
-    found = train_batch(net, chunks, gamma=1.0, lambda_=1.0)
+    result = train_batch(net, chunks, gamma=1.0, lambda_=1.0)
     normalization = net.encoder.features.parts[0][0]
     assert (float(normalization.count), float(normalization.mean)) == (3, pytest.approx(1002))
     last = net.compute_values({Columns.OBS: {"observation": torch.tensor([[1004.0]])}})
-    np.testing.assert_allclose(found.targets, last.detach().repeat(2), rtol=1e-5)
+    np.testing.assert_allclose(result.targets, last.detach().repeat(2), rtol=1e-5)
 
 
 @pytest.mark.parametrize("at_once", [2, 3, 100])
@@ -141,7 +138,7 @@ def test_a_recurrent_value_uses_the_state_of_each_step(at_once: int, monkeypatch
     net = network(spaces.Discrete(5), recurrence=3)
     states = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
     chunks = [chunk([0, 1, 2, 3], [0.0] * 3, states[:3], truncated=True), chunk([4, 2, 1], [0.0] * 2, states[3:])]
-    found = train_batch(net, chunks, gamma=1.0, lambda_=0.0, sequence=2)
+    result = train_batch(net, chunks, gamma=1.0, lambda_=0.0, sequence=2)
 
     def value(observation: int, state: dict[str, torch.Tensor]) -> tuple[float, dict[str, torch.Tensor]]:
         batch = {Columns.OBS: {"observation": torch.tensor([observation])}, Columns.STATE_IN: state}
@@ -154,19 +151,19 @@ def test_a_recurrent_value_uses_the_state_of_each_step(at_once: int, monkeypatch
 
     expected = [value(1, state_before(1))[0], value(2, state_before(2))[0], value(3, value(2, state_before(2))[1])[0]]
     expected += [value(2, state_before(4))[0], value(1, value(2, state_before(4))[1])[0]]
-    assert found.targets.tolist() == pytest.approx(expected, abs=1e-6)
+    assert result.targets.tolist() == pytest.approx(expected, abs=1e-6)
 
 
 def test_chunks_are_cut_into_sequences_with_their_first_states() -> None:
     net = network(spaces.Discrete(9), recurrence=1)
     states = np.arange(8, dtype=np.float32)[:, None]
     chunks = [chunk(list(range(6)), [0.0] * 5, states[:5]), chunk([6, 7, 8, 0], [0.0] * 3, states[5:])]
-    found = train_batch(net, chunks, gamma=1.0, lambda_=1.0, sequence=3)
-    assert found.sequences is not None
-    assert found.sequences.starts.tolist() == [0, 3, 5]
-    assert found.sequences.lengths.tolist() == [3, 2, 3]
-    assert found.units == 3
-    minibatch = found.take(torch.tensor([2, 1]))
+    result = train_batch(net, chunks, gamma=1.0, lambda_=1.0, sequence=3)
+    assert result.sequences is not None
+    assert result.sequences.starts.tolist() == [0, 3, 5]
+    assert result.sequences.lengths.tolist() == [3, 2, 3]
+    assert result.units == 3
+    minibatch = result.take(torch.tensor([2, 1]))
     assert minibatch.inputs[Columns.OBS]["observation"].tolist() == [6, 7, 8, 3, 4]
     assert minibatch.inputs[Columns.SEQ_LENS].tolist() == [3, 2]
     assert minibatch.inputs[Columns.STATE_IN]["h"].tolist() == [[5.0], [3.0]]
@@ -175,19 +172,12 @@ def test_chunks_are_cut_into_sequences_with_their_first_states() -> None:
 
 
 def test_steps_without_recurrence_are_taken_in_any_order(identity: Identity) -> None:
-    found = train_batch(identity, [chunk([2.0, 4.0, 8.0], [0.0, 1.0]), chunk([16.0, 32.0], [3.0])], gamma=1, lambda_=1)
-    minibatch = found.take(torch.tensor([2, 0]))
-    assert found.units == len(found) == 3
+    result = train_batch(identity, [chunk([2.0, 4.0, 8.0], [0.0, 1.0]), chunk([16.0, 32.0], [3.0])], gamma=1, lambda_=1)
+    minibatch = result.take(torch.tensor([2, 0]))
+    assert result.units == len(result) == 3
     assert minibatch.inputs[Columns.OBS]["observation"].tolist() == [[16.0], [2.0]]
-    assert minibatch.targets.tolist() == found.targets[[2, 0]].tolist()
+    assert minibatch.targets.tolist() == result.targets[[2, 0]].tolist()
     assert set(minibatch.inputs) == {Columns.OBS}
-
-
-def by_definition(rewards: list[float], values: list[float], bootstrap: float) -> list[float]:
-    """A_t = Σ_k (γλ)^k δ_{t+k} over one chunk (equation 11 of the paper), as a sum per step."""
-    following = [*values[1:], bootstrap]
-    deltas = [r + GAMMA * n - v for r, v, n in zip(rewards, values, following, strict=True)]
-    return [sum((GAMMA * LAMBDA) ** k * delta for k, delta in enumerate(deltas[t:])) for t in range(len(deltas))]
 
 
 def by_recursion(rewards: NDArray, values: NDArray, next_values: NDArray, lasts: NDArray, decay: float) -> list[float]:
@@ -202,33 +192,7 @@ def by_recursion(rewards: NDArray, values: NDArray, next_values: NDArray, lasts:
     return advantages[::-1]
 
 
-numbers = st.floats(-10, 10, width=32)
-chunks = st.lists(
-    st.tuples(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=6), numbers), min_size=1, max_size=5
-)
-
-
-@given(chunks)
-@settings(deadline=None)
-def test_advantages_equal_the_definition_for_consecutive_chunks(
-    chunks: list[tuple[list[tuple[float, float]], float]],
-) -> None:
-    expected, rewards, values, next_values, lasts = [], [], [], [], []
-    for steps, bootstrap in chunks:
-        rewarded, valued = [r for r, _ in steps], [v for _, v in steps]
-        expected += by_definition(rewarded, valued, bootstrap)
-        rewards += rewarded
-        values += valued
-        next_values += [*valued[1:], bootstrap]
-        lasts += [False] * (len(steps) - 1) + [True]
-    found = generalized_advantages(
-        np.array(rewards), np.array(values), np.array(next_values), np.array(lasts), GAMMA, LAMBDA
-    )
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
 @given(st.lists(st.integers(1, 300), min_size=1, max_size=6), st.sampled_from([0.0, LAMBDA, 1.0]), st.integers(0, 9))
-@settings(deadline=None)
 def test_advantages_of_chunks_of_any_lengths_equal_the_recursion(lengths: list[int], lambda_: float, seed: int) -> None:
     rewards, values, next_values = np.random.default_rng(seed).normal(size=(3, sum(lengths)))
     lasts = np.isin(np.arange(sum(lengths)), np.cumsum(lengths) - 1)
@@ -239,10 +203,10 @@ def test_advantages_of_chunks_of_any_lengths_equal_the_recursion(lengths: list[i
 
 def test_golden_numbers() -> None:
     """Two steps, then truncated with value 2; by hand: δ = (1 + .9·1 − 0, 0 + .9·2 − 1) = (1.9, .8)."""
-    found = generalized_advantages(
+    advantages = generalized_advantages(
         np.array([1.0, 0.0]), np.array([0.0, 1.0]), np.array([1.0, 2.0]), np.array([False, True]), GAMMA, LAMBDA
     )
-    np.testing.assert_allclose(found, [1.9 + 0.72 * 0.8, 0.8])
+    np.testing.assert_allclose(advantages, [1.9 + 0.72 * 0.8, 0.8])
 
 
 def batch(steps: int, sequence: int | None = None) -> TrainBatch:
@@ -267,26 +231,25 @@ def numbers_of(steps: Minibatch) -> list[int]:
     st.integers(1, 3),
     st.none() | st.integers(1, 7),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_each_step_of_each_policy_occurs_once_per_epoch(
     sizes: dict[str, int], size: int, epochs: int, sequence: int | None
 ) -> None:
-    seen: dict[str, Counter[int]] = {policy: Counter() for policy in sizes}
+    counts: dict[str, Counter[int]] = {policy: Counter() for policy in sizes}
     batches = {policy: batch(steps, sequence) for policy, steps in sizes.items()}
     for minibatch in minibatches(batches, size=size, epochs=epochs):
         for policy, steps in minibatch.items():
-            taken = numbers_of(steps)
-            assert 1 <= len(taken) <= size + (sequence or 1) * -(-size // (sequence or 1))
-            seen[policy].update(taken)
+            numbers = numbers_of(steps)
+            assert 1 <= len(numbers) <= size + (sequence or 1) * -(-size // (sequence or 1))
+            counts[policy].update(numbers)
     for policy, steps in sizes.items():
-        assert seen[policy] == Counter(dict.fromkeys(range(steps), epochs))
+        assert counts[policy] == Counter(dict.fromkeys(range(steps), epochs))
 
 
 def test_a_small_policy_is_trained_for_the_same_epochs() -> None:
-    found = list(minibatches({"large": batch(4000), "small": batch(100)}, size=400, epochs=10))
-    assert len(found) == 100
-    assert all(len(minibatch["small"].actions) == 10 for minibatch in found)
-    assert all(len(minibatch["large"].actions) == 400 for minibatch in found)
+    parts = list(minibatches({"large": batch(400), "small": batch(10)}, size=40, epochs=10))
+    sizes = [(len(minibatch["large"].actions), len(minibatch["small"].actions)) for minibatch in parts]
+    assert sizes == [(40, 1)] * 100
 
 
 def test_the_order_differs_between_epochs_and_depends_on_the_seed() -> None:

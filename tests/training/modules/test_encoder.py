@@ -40,9 +40,8 @@ def test_features_of_all_leaves() -> None:
     assert row[0].tolist() == pytest.approx([0.5, -0.5, 0, 0, 1, 1, 0, 1, 0, 0, 1, 1, 0])
 
 
-@pytest.mark.parametrize(
-    ("space", "value", "expected"),
-    [
+def test_finite_bounds_are_scaled(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[spaces.Box, list[float], list[float]]] = [
         (spaces.Box(0, 255, (2,), np.uint8), [0, 255], [0, 1]),
         (spaces.Box(-200, 200, (2,), np.float32), [-200, 100], [0, 0.75]),
         (spaces.Box(np.array([0, 100]), np.array([100, 300]), dtype=np.int64), [25, 200], [0.25, 0.5]),
@@ -50,13 +49,12 @@ def test_features_of_all_leaves() -> None:
         (spaces.Box(-3e38, 3e38, (2,), np.float32), [3, -30], [3, -30]),
         (spaces.Box(0, np.inf, (2,), np.float32), [300, 0], [300, 0]),
         (spaces.Box(np.array([0, 0]), np.array([255, 1]), dtype=np.int64), [51, 1], [51, 1]),
-    ],
-    ids=["image", "symmetric", "per element", "narrow", "huge", "half open", "mixed"],
-)
-def test_finite_bounds_are_scaled(space: spaces.Box, value: list[float], expected: list[float]) -> None:
-    features = ObservationFeatures(spaces.Dict(observation=space))
-    row = features({"observation": torch.as_tensor(np.array([value], space.dtype))})
-    assert row.tolist() == [pytest.approx(expected)]
+    ]
+    for space, value, expected in rows:
+        features = ObservationFeatures(spaces.Dict(observation=space))
+        row = features({"observation": torch.as_tensor(np.array([value], space.dtype))})
+        with subtests.test(str(space)):
+            assert row.tolist() == [pytest.approx(expected)]
 
 
 def test_convolutions_are_equivariant_to_translation() -> None:
@@ -93,20 +91,13 @@ def test_small_images_have_equal_features_and_gradients_as_products(shape: tuple
     torch.testing.assert_close(gradients, [parameter.grad for parameter in features.parameters()])
 
 
-def test_strides_reduce_the_width() -> None:
-    space = spaces.Dict(observation=spaces.Box(0, 255, (84, 84, 4), np.uint8))
-    features = ObservationFeatures(space, convolutions=[(16, 8, 4), (32, 4, 2)])
-    assert features.width == 32 * 9 * 9
-    image = torch.randint(0, 256, (2, 84, 84, 4), dtype=torch.uint8)
-    assert features({"observation": image}).shape == (2, features.width)
-
-
 @pytest.mark.parametrize("channels", [None, "first"])
 def test_channels_first_and_last_give_the_same_features(channels: Channels | None) -> None:
     layers = [(16, 8, 4), (32, 4, 2)]
     last = ObservationFeatures(spaces.Dict(observation=spaces.Box(0, 255, (84, 60, 4), np.uint8)), layers)
     space = spaces.Dict(observation=spaces.Box(0, 255, (4, 84, 60), np.uint8))
     first = ObservationFeatures(space, layers, channels=channels)
+    assert first.width == 32 * 9 * 6
     first.load_state_dict(last.state_dict())
     image = torch.randint(0, 256, (2, 84, 60, 4), dtype=torch.uint8)
     features = first({"observation": image.permute(0, 3, 1, 2)})
@@ -119,29 +110,23 @@ def test_the_setting_decides_where_the_shape_misleads() -> None:
     assert ObservationFeatures(space, [(5, 2, 1)], channels="last").width == 5 * 1 * 5
 
 
-@pytest.mark.parametrize(
-    ("shape", "channels"),
-    [
-        *(((3, 84, 84), "first"), ((1, 28, 28), "first"), ((2, 6, 7), "first"), ((17, 40, 40), "first")),
-        *(((84, 84, 3), "last"), ((6, 7, 2), "last"), ((8, 8, 111), "last"), ((3, 3, 2), "last"), ((6, 7, 20), "last")),
-    ],
-)
-def test_the_axis_of_channels_is_seen_in_the_shape(shape: tuple[int, ...], channels: Channels) -> None:
-    assert channels_of(shape) == channels
+def test_the_axis_of_channels_is_seen_in_the_shape() -> None:
+    for shape in ((3, 84, 84), (1, 28, 28), (2, 6, 7), (17, 40, 40)):
+        assert channels_of(shape) == "first"
+    for shape in ((84, 84, 3), (6, 7, 2), (8, 8, 111), (3, 3, 2), (6, 7, 20)):
+        assert channels_of(shape) == "last"
 
 
-@pytest.mark.parametrize(
-    ("space", "convolutions", "message"),
-    [
+def test_unsupported_convolutions_are_rejected(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[spaces.Space, list[tuple[int, int, int]], str]] = [
         (spaces.Box(0, 1, (9,)), [(8, 3, 1)], "no part"),
         (spaces.Box(0, 1, (3, 4, 1)), [(8, 4, 1)], "kernel 4 is larger than images of 3×4"),
         (spaces.Box(0, 1, (9, 9, 1)), [(8, 3, 3), (8, 4, 1)], "kernel 4 is larger than images of 3×3"),
         (spaces.Text(3), [], "unsupported observation space"),
-    ],
-)
-def test_unsupported_convolutions_are_rejected(space: spaces.Space, convolutions: list, message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        ObservationFeatures(spaces.Dict(observation=space), convolutions)
+    ]
+    for space, convolutions, message in rows:
+        with subtests.test(message), pytest.raises(ConfigError, match=message):
+            ObservationFeatures(spaces.Dict(observation=space), convolutions)
 
 
 def test_only_floats_are_normalized() -> None:
@@ -179,12 +164,12 @@ def test_a_box_of_shape_empty_is_one_number(normalize: bool) -> None:
 @given(
     st.lists(st.integers(1, 40), min_size=1, max_size=5), st.floats(-1e4, 1e4), st.floats(1e-2, 1e3), st.integers(0, 9)
 )
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_statistics_of_batches_equal_those_of_all_values(
     sizes: list[int], mean: float, deviation: float, seed: int
 ) -> None:
-    random = np.random.default_rng(seed)
-    batches = [random.normal(mean, deviation, (size, 3)) for size in sizes]
+    rng = np.random.default_rng(seed)
+    batches = [rng.normal(mean, deviation, (size, 3)) for size in sizes]
     normalization = RunningNormalization((3,))
     for batch in batches:
         normalization.update(torch.from_numpy(batch))
@@ -211,9 +196,7 @@ def test_values_are_shifted_scaled_and_clipped() -> None:
     torch.testing.assert_close(normalization(values), torch.tensor([[3.0, -MAX_DEVIATIONS], [MAX_DEVIATIONS, 2.0]]))
     normalization.update(torch.tensor([[1.0, 10.0], [3.0, 10.0]]))
     scaled = normalization(torch.tensor([[3.0, 10.0], [1.5, 10.1]]))
-    assert torch.allclose(scaled, torch.tensor([[1.0, 0.0], [-0.5, MAX_DEVIATIONS]]), atol=1e-5), (
-        "a constant is not scaled"
-    )
+    assert torch.allclose(scaled, torch.tensor([[1.0, 0.0], [-0.5, MAX_DEVIATIONS]]), atol=1e-5)
 
 
 def test_statistics_are_part_of_the_weights() -> None:

@@ -56,16 +56,15 @@ def test_illegal_actions_are_neither_best_nor_explored(kind: dict[str, object]) 
     explored = module.forward_exploration(inputs)[Columns.ACTION_DIST_INPUTS].softmax(-1)
     assert (explored[~allowed] == 0).all()
     torch.testing.assert_close(explored.sum(-1), torch.ones(len(values)))
-    assert torch.equal(values, module.forward_inference(inputs)[Columns.ACTION_DIST_INPUTS]), (
-        "greedy inference is deterministic"
-    )
+    again = module.forward_inference(inputs)[Columns.ACTION_DIST_INPUTS]
+    assert torch.equal(values, again), "greedy inference is deterministic"
 
 
 def test_epsilon_greedy_supports_values_of_zero() -> None:
     """RLlib masks by `q != 0`: it never explores a legal action of value 0, and fails on a row of zeros."""
     values = torch.tensor([[0.0, 0.0, MASKED_LOGIT], [0.0, 3.0, MASKED_LOGIT], [MASKED_LOGIT, 0.0, MASKED_LOGIT]])
-    found = epsilon_greedy(values, 0.2).softmax(-1)
-    torch.testing.assert_close(found, torch.tensor([[0.9, 0.1, 0.0], [0.1, 0.9, 0.0], [0.0, 1.0, 0.0]]))
+    explored = epsilon_greedy(values, 0.2).softmax(-1)
+    torch.testing.assert_close(explored, torch.tensor([[0.9, 0.1, 0.0], [0.1, 0.9, 0.0], [0.0, 1.0, 0.0]]))
     random = epsilon_greedy(torch.zeros(1, 3), 1.0).softmax(-1)
     torch.testing.assert_close(random, torch.full((1, 3), 1 / 3))
 
@@ -98,11 +97,11 @@ def test_a_recurrent_network_learns_from_sequences_as_it_acts(kind: dict[str, ob
     """Compares two concatenated sequences of four steps, from stored states, with acting step by step."""
     module, sequences, steps = network(recurrence=6, **kind), 2, 4
     shape = sequences, steps
-    seen = {name: column.unflatten(0, shape) for name, column in batch([[1, 1, 1]] * 8)[Columns.OBS].items()}
+    columns = {name: column.unflatten(0, shape) for name, column in batch([[1, 1, 1]] * 8)[Columns.OBS].items()}
     actions = torch.randint(0, 3, shape)
     stored = {HIDDEN: torch.randn(*shape, 6), PREVIOUS_ACTION: torch.randint(0, 4, (*shape, 1)).float()}
-    flat = {name: column.flatten(0, 1) for name, column in (seen | stored).items()}
-    observations = {name: flat[name] for name in seen}
+    flat = {name: column.flatten(0, 1) for name, column in (columns | stored).items()}
+    observations = {name: flat[name] for name in columns}
     hidden = module.hidden_states(observations, {key: flat[key] for key in stored}, actions.flatten(), steps)
     learned = module.expected(module.head_outputs(observations, hidden=hidden)).unflatten(0, shape)
     following = module.hidden_after(observations, actions.flatten(), hidden)
@@ -110,7 +109,7 @@ def test_a_recurrent_network_learns_from_sequences_as_it_acts(kind: dict[str, ob
 
     state = {key: column[:, 0] for key, column in stored.items()}
     for step in range(steps):
-        inputs = {Columns.OBS: {name: column[:, step] for name, column in seen.items()}}
+        inputs = {Columns.OBS: {name: column[:, step] for name, column in columns.items()}}
         answer = module.forward_inference(inputs | {Columns.STATE_IN: state})
         torch.testing.assert_close(learned[:, step], answer[Columns.ACTION_DIST_INPUTS])
         assert (answer[Columns.STATE_OUT][PREVIOUS_ACTION][:, 0] == learned[:, step].argmax(-1) + 1).all()

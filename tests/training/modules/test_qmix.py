@@ -97,14 +97,6 @@ def test_learning_computes_the_values_of_acting() -> None:
         torch.testing.assert_close(following[step][there][:, [0, 2]], later[there][:, [0, 2]])
 
 
-def test_the_previous_action_is_the_greedy_one_by_default() -> None:
-    module = network()
-    assert module.get_initial_state()[PREVIOUS_ACTION].tolist() == [0]  # the initial state of a graph is zero
-    output = module.forward_inference({Columns.OBS: observation_batch(20), Columns.STATE_IN: initial_state(20)})
-    best = output[Columns.ACTION_DIST_INPUTS].argmax(-1)
-    assert output[Columns.STATE_OUT][PREVIOUS_ACTION].squeeze(-1).tolist() == (best + 1).tolist()
-
-
 def test_the_previous_action_is_an_input() -> None:
     module, rows = network(), observation_batch(1)
     outputs = [
@@ -124,17 +116,17 @@ def test_a_graph_starts_like_its_module_and_remembers_drawn_actions(tmp_path: Pa
     export_policy(module, spaces, tmp_path / "own.onnx")
     policy = OnnxPolicy(tmp_path / "own.onnx")
     draws = [np.random.default_rng(agent) for agent in range(agents)]
-    state, own, others = None, initial_state(agents), 0
+    state, state_of_module, explored = None, initial_state(agents), 0
     for _ in range(4):
         rows = observation_batch(agents)
-        expected = module.forward_inference({Columns.OBS: rows, Columns.STATE_IN: own})
+        expected = module.forward_inference({Columns.OBS: rows, Columns.STATE_IN: state_of_module})
         answer = policy.act({name: row.numpy() for name, row in rows.items()}, state=state, explore=True, rng=draws)
         assert answer.dist_inputs is not None
         torch.testing.assert_close(torch.as_tensor(answer.dist_inputs), expected[Columns.ACTION_DIST_INPUTS])
-        others += int((answer.actions != answer.dist_inputs.argmax(-1)).sum())
-        taken = torch.as_tensor(answer.actions).float().unsqueeze(-1) + 1
-        state, own = answer.state, {HIDDEN: expected[Columns.STATE_OUT][HIDDEN], PREVIOUS_ACTION: taken}
-    assert others > 0
+        explored += int((answer.actions != answer.dist_inputs.argmax(-1)).sum())
+        drawn = torch.as_tensor(answer.actions).float().unsqueeze(-1) + 1
+        state, state_of_module = answer.state, {HIDDEN: expected[Columns.STATE_OUT][HIDDEN], PREVIOUS_ACTION: drawn}
+    assert explored > 0
 
 
 @given(
@@ -145,7 +137,7 @@ def test_a_graph_starts_like_its_module_and_remembers_drawn_actions(tmp_path: Pa
     seed=st.integers(0, 2**31),
     data=st.data(),
 )
-@examples(200)
+@examples(75)
 def test_the_mixer_is_monotonic(
     agents: int, size: int, width: int, scale: float, seed: int, data: st.DataObject
 ) -> None:
@@ -162,14 +154,6 @@ def test_the_mixer_is_monotonic(
     more[:, agent] += data.draw(st.floats(0.001, 100))
     before, after = mixer(values, states), mixer(more, states)
     assert (after >= before - 1e-9 * (1 + before.abs())).all()
-
-
-def test_a_mixer_with_negative_weights_is_not_monotonic(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Monotonicity requires the absolute values."""
-    torch.manual_seed(0)
-    mixer, states, values = MonotonicMixer(2, 3, 4), torch.randn(64, 3), torch.randn(64, 2)
-    monkeypatch.setattr(torch.Tensor, "abs", lambda tensor: tensor)
-    assert (mixer(values + torch.tensor([1.0, 0.0]), states) < mixer(values, states)).any()
 
 
 def test_a_small_mixer_by_hand() -> None:
@@ -191,9 +175,9 @@ def test_a_small_mixer_by_hand() -> None:
     }
     state = {name: torch.zeros_like(tensor) for name, tensor in mixer.state_dict().items()}
     mixer.load_state_dict(state | {name: torch.tensor(rows, dtype=torch.float64) for name, rows in weights.items()})
-    found = mixer(torch.tensor([[1.0, -1.0]], dtype=torch.float64), torch.tensor([[2.0]], dtype=torch.float64))
+    joint = mixer(torch.tensor([[1.0, -1.0]], dtype=torch.float64), torch.tensor([[2.0]], dtype=torch.float64))
     expected = 3 * 1 + 2 * (np.exp(-5) - 1) - 2 * 0.75 + 0.125
-    np.testing.assert_allclose(found.detach().numpy(), [[expected]], rtol=1e-12)
+    np.testing.assert_allclose(joint.detach().numpy(), [[expected]], rtol=1e-12)
 
 
 def test_states_are_normalized_if_requested() -> None:

@@ -1,8 +1,6 @@
 """When a run shows its nodes and its simulators, and when it moves to other nodes."""
 
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import ray
@@ -11,7 +9,7 @@ from ray.exceptions import RpcError
 from league import ray_cluster
 from league.registry.gateways import Gateway
 from league.registry.registry import Registry
-from tests.support.leagues import tictactoe
+from tests.support.leagues.registries import LEAGUE
 from training.algorithms.resources import Resources
 from training.runs import node_watch, simulator_watch, tune
 from training.runs.node_watch import NodeWatch
@@ -109,15 +107,7 @@ def test_a_run_stays_while_all_nodes_with_cpus_have_left(monkeypatch: pytest.Mon
     assert nodes.moves == 0
 
 
-LEAGUE = tictactoe.LEAGUE
 TRAINING = Gateway("ws://127.0.0.1:8001", "secret", LEAGUE, "training")
-
-
-@pytest.fixture
-def registry(tmp_path: Path) -> Iterator[Registry]:
-    opened = tictactoe.registry(tmp_path / "home")
-    yield opened
-    opened.close()
 
 
 def test_changes_are_said_once(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:

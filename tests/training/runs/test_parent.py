@@ -10,15 +10,9 @@ from league.errors import ConfigError
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, Manifest
-from league.settings import Storage
 from tests.support.leagues import registries
 from tests.support.leagues.registries import LEAGUE
 from training.runs.parent import check_network, start_version
-
-
-@pytest.fixture
-def registry(tmp_path: Path) -> Registry:
-    return registries.registered(Registry.open(Storage.at(tmp_path)))
 
 
 def publish(registry: Registry, **manifest: Any) -> CheckpointRef:
@@ -53,32 +47,33 @@ def test_in_place_of_an_imported_version_the_newest_one_continues(registry: Regi
     assert start_version(registry, imported, registries.config(), None) == trained
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "settings", "changed"),
-    [
-        ("ppo", {"hidden": [32]}, "hidden"),
-        ("maddpg", {"critic": "own"}, "critic"),
-        ("qmix", {"mixer": "vdn"}, "mixer"),
-        ("maddpg", {"lr": 0.5, "gamma": 0.5}, None),
-    ],
-)
-def test_a_version_continues_with_its_own_network_only(
-    registry: Registry, algorithm: str, settings: dict[str, Any], changed: str | None
-) -> None:
-    version = registry.versions.resolve(publish(registry, algorithm=algorithm, settings={"algorithm": algorithm}))
-    config = LeagueConfig.from_mapping(registries.config().model_dump() | {"training": {"algorithm": algorithm}})
-    check_network(version, config)
-    if changed is None:
-        check_network(version, config.with_training(**settings))
-        return
-    with pytest.raises(ConfigError, match=rf"^training\.{changed}: tictactoe@1 was trained with .*, got "):
-        check_network(version, config.with_training(**settings))
+def with_algorithm(algorithm: str) -> LeagueConfig:
+    return LeagueConfig.from_mapping(registries.config().model_dump() | {"training": {"algorithm": algorithm}})
+
+
+def test_a_version_continues_with_its_own_network_only(registry: Registry, subtests: pytest.Subtests) -> None:
+    """Settings that did not exist when the version was trained have their defaults."""
+    for algorithm, changed, value in (
+        ("ppo", "hidden", [32]),
+        ("ppo", "recurrence", {"width": 4}),
+        ("maddpg", "critic", "own"),
+        ("qmix", "mixer", "vdn"),
+        ("dqn", "dueling", False),
+    ):
+        with subtests.test(changed):
+            version = registry.versions.resolve(
+                publish(registry, algorithm=algorithm, settings={"algorithm": algorithm})
+            )
+            config = with_algorithm(algorithm)
+            check_network(version, config)
+            check_network(version, config.with_training(lr=0.5, gamma=0.5))
+            with pytest.raises(ConfigError, match=rf"^training\.{changed}: tictactoe@\d was trained with .*, got "):
+                check_network(version, config.with_training(**{changed: value}))
 
 
 def test_an_algorithm_continues_what_one_that_it_is_derived_from_has_trained(registry: Registry) -> None:
     settings = {"algorithm": "marwil", "data": "games"}
     version = registry.versions.resolve(publish(registry, algorithm="marwil", settings=settings))
     check_network(version, registries.config())
-    other = LeagueConfig.from_mapping(registries.config().model_dump() | {"training": {"algorithm": "dqn"}})
     with pytest.raises(ConfigError, match=r"^training\.algorithm: tictactoe@1 was trained with marwil, got dqn$"):
-        check_network(version, other)
+        check_network(version, with_algorithm("dqn"))

@@ -1,10 +1,14 @@
+"""What a run prints, and the line at the end of a run that leaves a resource idle."""
+
 import io
 from collections.abc import Iterable
 
+import pytest
 from rich.console import Console
 
 from league.config.ppo import PPOConfig
 from training.algorithms.resources import Resources
+from training.runs.advice import LEAST_SECONDS, advice, idle_share
 from training.runs.progress import TrainingProgress, clock
 
 SETTINGS = PPOConfig(steps=1000, minutes=2)
@@ -65,14 +69,8 @@ def test_a_report_without_an_update_has_no_speed() -> None:
 
 
 def test_shares_of_sampling_and_learning_are_of_all_phases() -> None:
-    phases = {
-        "time/sampling": 0.5,
-        "time/learning": 1.25,
-        "time/weights": 0.15,
-        "time/other": 0.1,
-        "time/checkpoint": 9.0,
-    }
-    (line,) = output_of(METRICS | phases).splitlines()
+    phases = {"sampling": 0.5, "learning": 1.25, "weights": 0.15, "other": 0.1, "checkpoint": 9.0}
+    (line,) = output_of(METRICS | {f"time/{name}": value for name, value in phases.items()}).splitlines()
     assert "12 steps/s (25% sampling, 62% learning)  1:00 elapsed" in line
 
 
@@ -119,3 +117,59 @@ def test_opponents_whose_games_are_not_scored_are_not_shown() -> None:
     scored = {"opponents/a@1/share": 0.2, "opponents/a@1/score": 0.5}
     (line,) = output_of(METRICS | scored | {"opponents/a@2/share": 0.4}).splitlines()
     assert line.endswith("; score 50% against a@1")
+
+
+def seconds(idle: float | None = None, **phases: float) -> dict[str, float]:
+    """Of a run, in percent. phases: of the learner's process. idle: of the runners; None without any."""
+    of_learner = {f"time/{name}": 10 * percent for name, percent in phases.items()}
+    of_runners = {} if idle is None else {"time/runners_idle": idle, "time/runners_sampling": 100 - idle}
+    return of_learner | of_runners
+
+
+def said(
+    times: dict[str, float], runners: int = 1, lag: int = 1, cores: int = 16, gpu_use: float | None = None
+) -> str | None:
+    used = Resources(runners, num_envs=32, threads=1, gpus=0.0)
+    return advice(times, used, PPOConfig(lag=lag), cores, gpu_use)
+
+
+def test_idle_runners_are_named_with_the_number_that_is_enough() -> None:
+    assert said(seconds(idle=88, waiting=0, learning=98, other=2), runners=14) == (
+        "The learner waits 0% of the time, its 14 runners are idle 88%: learning limits the run. `runners: 3` is"
+        " enough. Use fewer epochs, larger minibatches or a smaller network (docs/limits.md#mostly-learning)."
+    )
+
+
+@pytest.mark.parametrize(
+    ("gpu_use", "change"),
+    [(None, "larger minibatches or a smaller network"), (0.1, "The GPU is used 10%"), (0.9, "Use fewer epochs or a")],
+)
+def test_one_idle_runner_means_that_learning_limits_the_run(gpu_use: float | None, change: str) -> None:
+    sentence = said(seconds(idle=90, waiting=1, learning=99), gpu_use=gpu_use) or ""
+    assert f"its runner is idle 90%: learning limits the run. {change}" in sentence.replace("Use fewer epochs, ", "")
+
+
+@pytest.mark.parametrize(("cores", "change"), [(16, "Use more `runners`"), (2, "Use more cores")])
+def test_a_learner_that_waits_needs_more_samples(cores: int, change: str) -> None:
+    sentence = said(seconds(idle=3, waiting=40, learning=60), cores=cores) or ""
+    assert f"waits 40% of the time, its runner is idle 3%: sampling limits the run. {change}" in sentence
+
+
+def test_runners_and_learner_that_take_turns_could_overlap() -> None:
+    times = seconds(idle=60, waiting=40, learning=60)
+    assert "`lag: 1`" in (said(times, lag=0) or "")
+    assert said(times) is None
+
+
+def test_a_process_that_mostly_samples_could_have_runners() -> None:
+    times = seconds(sampling=70, learning=30)
+    assert "samples for 70% of the time: `runners` would" in (said(times, runners=0) or "")
+    assert said(times, runners=0, cores=1) is None
+    assert said(seconds(sampling=30, learning=70), runners=0) is None
+
+
+def test_a_balanced_or_short_run_gets_no_advice() -> None:
+    assert said(seconds(idle=30, waiting=10, learning=85, other=5)) is None
+    short = {"time/waiting": 0.9 * LEAST_SECONDS, "time/runners_idle": 0.0, "time/runners_sampling": 10.0}
+    assert said(short) is None
+    assert idle_share({}) is None

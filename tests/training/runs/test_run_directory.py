@@ -1,10 +1,11 @@
 import shutil
 import threading
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from sqlalchemy import update
@@ -13,8 +14,9 @@ from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
 from league.errors import AlreadyRunning, ConfigError, InvalidInput, LeagueError, NotFound, RunCorrupt, UnknownVersion
 from league.registry.registry import Registry
+from league.registry.storage import rows
 from league.registry.storage.manifest import EXPLOITER
-from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunRow
+from league.registry.storage.rows import RunRow
 from league.settings import Storage
 from tests.support.leagues import tictactoe as league_of_tictactoe
 from tests.support.leagues.training_leagues import tictactoe
@@ -90,11 +92,9 @@ def test_a_resumed_run_keeps_what_was_chosen_when_it_began(registry: Registry, s
 
 def test_a_run_with_a_name_fits_the_machine_that_continues_it(registry: Registry) -> None:
     RunDirectory.begin(registry.storage, tictactoe(**AUTO), None, None, name="night-1").use(CHOSEN)
-    found = RunDirectory.find(registry, tictactoe(**AUTO), "night-1")
-    assert found is not None
-    assert found.record.config == tictactoe(**AUTO | {"num_envs": 16, "batch_scale": 1}), (
-        "what is learned is that of the run"
-    )
+    run = RunDirectory.find(registry, tictactoe(**AUTO), "night-1")
+    assert run is not None
+    assert run.record.config == tictactoe(**AUTO | {"num_envs": 16, "batch_scale": 1}), "what is learned is kept"
 
 
 def test_a_complete_run_continues_with_a_larger_budget(registry: Registry, storage: Storage) -> None:
@@ -132,7 +132,9 @@ def test_runs_are_resumed_by_role(registry: Registry, storage: Storage) -> None:
     assert RunDirectory.resume(registry, written).id == main.id
     resumed = RunDirectory.resume(registry, written, EXPLOITER)
     assert (resumed.id, resumed.record) == (exploiter.id, exploiter.record)
-    assert [(each.ref, each.share) for each in resumed.record.config.training.opponents.fixed] == [("tictactoe@3", 1)]
+    assert [(opponent.ref, opponent.share) for opponent in resumed.record.config.training.opponents.fixed] == [
+        ("tictactoe@3", 1)
+    ]
 
 
 def test_settings_of_exploiters_concern_the_runs_of_exploiters(registry: Registry, storage: Storage) -> None:
@@ -208,13 +210,15 @@ def test_a_run_is_trained_on_one_machine_at_a_time(
 def test_a_run_continues_when_the_machine_that_trained_it_is_silent(
     registry: Registry, elsewhere: Registry, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(run_directory, "POLL", 0.01)
+    def fall_silent(_: float) -> None:
+        monkeypatch.setattr(rows, "HEARTBEAT_TIMEOUT", timedelta(0))
+
+    monkeypatch.setattr(run_directory, "time", SimpleNamespace(sleep=fall_silent))
     run = RunDirectory.begin(registry.storage, tictactoe(), None, None)
     start(registry, run)
-    almost_silent = datetime.now(UTC) - HEARTBEAT_TIMEOUT + timedelta(seconds=3)
-    change(registry, run, reported_state="running", driver="trainer-7/boot/1:10:20", heartbeat_at=almost_silent)
+    change(registry, run, reported_state="running", driver="trainer-7/boot/1:10:20", heartbeat_at=datetime.now(UTC))
     assert RunDirectory.resume(elsewhere, tictactoe()).id == run.id
-    assert datetime.now(UTC) > almost_silent + HEARTBEAT_TIMEOUT
+    assert timedelta(0) == rows.HEARTBEAT_TIMEOUT
     assert f"{run.id} was running on trainer-7; waiting for up to 60 s" in caplog.text
 
 
@@ -247,106 +251,101 @@ def test_a_changed_record_in_the_registry_is_named(registry: Registry, storage: 
 
 def test_a_run_with_a_name_keeps_its_settings_but_not_its_resources(registry: Registry) -> None:
     """A machine that is too small for a run of a night must not stop all later nights."""
-    begun = tictactoe(runners=8, gpus=1, lr=0.01, steps=1000)
-    RunDirectory.begin(registry.storage, begun, None, None, name="night-1")
-    found = RunDirectory.find(registry, tictactoe(runners=1, gpus=0, lr=0.5, steps=10), "night-1")
-    assert found is not None
-    settings = found.record.config.training
+    config = tictactoe(runners=8, gpus=1, lr=0.01, steps=1000)
+    RunDirectory.begin(registry.storage, config, None, None, name="night-1")
+    run = RunDirectory.find(registry, tictactoe(runners=1, gpus=0, lr=0.5, steps=10), "night-1")
+    assert run is not None
+    settings = run.record.config.training
     assert (settings.runners, settings.gpus, settings.steps) == (1, 0, 1000)
-    assert settings.model_dump()["lr"] == begun.training.model_dump()["lr"]
+    assert settings.model_dump()["lr"] == config.training.model_dump()["lr"]
 
 
 def test_runs_of_nights_and_gates_are_not_resumed_by_hand(storage: Storage, registry: Registry) -> None:
-    own = RunDirectory.begin(storage, tictactoe(), None, None)
+    by_hand = RunDirectory.begin(storage, tictactoe(), None, None)
     RunDirectory.begin(storage, tictactoe(seed=7), None, None, name="99990101-200000-night-1")
-    assert RunDirectory.resume(registry, tictactoe()).id == own.id
+    assert RunDirectory.resume(registry, tictactoe()).id == by_hand.id
 
 
 def with_opponents(*refs: str) -> LeagueConfig:
     return league_of_tictactoe.config().with_training(opponents=[{"ref": ref, "share": 0.3} for ref in refs])
 
 
-def test_references_are_pinned_when_training_starts(tmp_path: Path) -> None:
-    registry = league_of_tictactoe.registry(tmp_path)
-    for _ in range(2):
-        league_of_tictactoe.publish(registry, league_of_tictactoe.graph())
-    registry.aliases.set("tictactoe", "champion", 1, expected=None, actor="me", reason="first")
+def promote(registry: Registry, number: int) -> None:
+    registry.aliases.set("tictactoe", "champion", number, expected=None, actor="me", reason="first")
+
+
+@pytest.fixture
+def two_versions(tmp_path: Path) -> Iterator[Registry]:
+    with closing(league_of_tictactoe.registry(tmp_path)) as registry:
+        for _ in range(2):
+            league_of_tictactoe.publish(registry, league_of_tictactoe.graph())
+        yield registry
+
+
+@pytest.fixture
+def mixed_champion(two_versions: Registry) -> Registry:
+    """The champion is a mixture, @3, of two versions."""
+    promote(two_versions, two_versions.publisher.publish_mixture("tictactoe", {1: 0.25, 2: 0.75}).number)
+    return two_versions
+
+
+def pins_of(registry: Registry, league: LeagueConfig, trials: Sequence[LeagueConfig] = ()) -> dict[str, str]:
+    return pin_opponents(league, registry, registry.leagues.get("tictactoe").interface, trials)
+
+
+def test_references_are_pinned_when_training_starts(two_versions: Registry) -> None:
+    promote(two_versions, 1)
     league = with_opponents("@champion", "tictactoe@2", "script:random")
-    pins = pin_opponents(league, registry, registry.leagues.get("tictactoe").interface)
+    pins = pins_of(two_versions, league)
     assert pins == {"@champion": "tictactoe@1", "tictactoe@2": "tictactoe@2", "script:random": "script:random"}
     opponents = with_pins(league, pins).training.opponents.fixed
     assert [opponent.ref for opponent in opponents] == ["tictactoe@1", "tictactoe@2", "script:random"]
     assert [opponent.share for opponent in opponents] == [0.3, 0.3, 0.3]
 
 
-def test_the_magnet_is_pinned_too(tmp_path: Path) -> None:
-    registry = league_of_tictactoe.registry(tmp_path)
-    league_of_tictactoe.publish(registry, league_of_tictactoe.graph())
-    registry.aliases.set("tictactoe", "champion", 1, expected=None, actor="me", reason="first")
-    spaces = registry.leagues.get("tictactoe").interface
+def test_the_magnet_is_pinned_too(two_versions: Registry) -> None:
+    promote(two_versions, 1)
     for ref, pinned in (("@champion", {"@champion": "tictactoe@1"}), ("uniform", {})):
         league = league_of_tictactoe.config().with_training(magnet={"ref": ref, "weight": 0.1})
-        assert pin_opponents(league, registry, spaces) == pinned
+        assert pins_of(two_versions, league) == pinned
         settings = with_pins(league, pinned).training
         assert isinstance(settings, PPOConfig)
         assert settings.magnet is not None
         assert settings.magnet.ref == pinned.get(ref, ref)
 
 
-def mixed_champion(home: Path) -> Registry:
-    """The champion is a mixture, @3, of two versions."""
-    registry = league_of_tictactoe.registry(home)
-    for _ in range(2):
-        league_of_tictactoe.publish(registry, league_of_tictactoe.graph())
-    number = registry.publisher.publish_mixture("tictactoe", {1: 0.25, 2: 0.75}).number
-    registry.aliases.set("tictactoe", "champion", number, expected=None, actor="me", reason="first")
-    return registry
-
-
-def test_a_mixture_is_pinned_as_one_and_played_by_its_members(tmp_path: Path) -> None:
-    registry = mixed_champion(tmp_path)
-    spaces = registry.leagues.get("tictactoe").interface
+def test_a_mixture_is_pinned_as_one_and_played_by_its_members(mixed_champion: Registry) -> None:
     league = with_opponents("@champion", "script:random")
-    pins = pin_opponents(league, registry, spaces)
+    pins = pins_of(mixed_champion, league)
     assert pins == {"@champion": "tictactoe@3", "script:random": "script:random"}
     fixed = with_pins(league, pins).training.opponents.fixed
-    played = without_mixtures(fixed, registry.storage)
-    assert [each.ref for each in played] == ["tictactoe@1", "tictactoe@2", "script:random"]
-    assert [each.share for each in played] == pytest.approx([0.075, 0.225, 0.3])
+    played = without_mixtures(fixed, mixed_champion.storage)
+    assert [opponent.ref for opponent in played] == ["tictactoe@1", "tictactoe@2", "script:random"]
+    assert [opponent.share for opponent in played] == pytest.approx([0.075, 0.225, 0.3])
     magnet = league_of_tictactoe.config().with_training(magnet={"ref": "@champion", "weight": 0.1})
-    with pytest.raises(
-        InvalidInput, match=r"tictactoe@3 is a mixture \(@1 25.0 %, @2 75.0 %\): name one of its members"
-    ):
-        pin_opponents(magnet, registry, spaces)
+    with pytest.raises(InvalidInput, match=r"tictactoe@3 is a mixture \(@1 25.0 %, @2 75.0 %\): name one of its memb"):
+        pins_of(mixed_champion, magnet)
 
 
-def test_in_training_a_search_version_plays_without_its_search(tmp_path: Path) -> None:
-    registry = league_of_tictactoe.registry(tmp_path)
-    league_of_tictactoe.publish(registry, league_of_tictactoe.graph())
-    registry.publisher.publish_search("tictactoe", 1, "puct", 8, 1.0)
-    league = with_opponents("@2").with_training(teacher={"ref": "@2", "weight": 1})
-    assert pin_opponents(league, registry, registry.leagues.get("tictactoe").interface) == {"@2": "tictactoe@1"}
+def test_in_training_a_search_version_plays_without_its_search(two_versions: Registry) -> None:
+    two_versions.publisher.publish_search("tictactoe", 1, "puct", 8, 1.0)
+    league = with_opponents("@3").with_training(teacher={"ref": "@3", "weight": 1})
+    assert pins_of(two_versions, league) == {"@3": "tictactoe@1"}
 
 
-def test_the_references_of_a_sweeps_trials_are_pinned_too(tmp_path: Path) -> None:
-    registry = mixed_champion(tmp_path)
-    spaces = registry.leagues.get("tictactoe").interface
+def test_the_references_of_a_sweeps_trials_are_pinned_too(mixed_champion: Registry) -> None:
     trials = [
         with_opponents("@champion"),
         league_of_tictactoe.config().with_training(teacher={"ref": "@2", "weight": 1}),
     ]
-    pins = pin_opponents(with_opponents("script:random"), registry, spaces, trials)
+    pins = pins_of(mixed_champion, with_opponents("script:random"), trials)
     assert pins == {"script:random": "script:random", "@champion": "tictactoe@3", "@2": "tictactoe@2"}
     trials += [league_of_tictactoe.config().with_training(teacher={"ref": "@champion", "weight": 1})]
     with pytest.raises(InvalidInput, match=r"tictactoe@3 is a mixture"):
-        pin_opponents(with_opponents("script:random"), registry, spaces, trials)
+        pins_of(mixed_champion, with_opponents("script:random"), trials)
 
 
-@pytest.mark.parametrize(
-    ("ref", "error"),
-    [("@3", UnknownVersion), ("champion", ConfigError), ("script:stockfish", LeagueError)],
-)
-def test_unknown_opponents_are_rejected(tmp_path: Path, ref: str, error: type[LeagueError]) -> None:
-    registry = league_of_tictactoe.registry(tmp_path)
-    with pytest.raises(error, match=ref.strip("@").removeprefix("script:")):
-        pin_opponents(with_opponents(ref), registry, registry.leagues.get("tictactoe").interface)
+def test_unknown_opponents_are_rejected(two_versions: Registry) -> None:
+    for ref, error in (("@3", UnknownVersion), ("champion", ConfigError), ("script:stockfish", LeagueError)):
+        with pytest.raises(error, match=ref.strip("@").removeprefix("script:")):
+            pins_of(two_versions, with_opponents(ref))

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import contextmanager
 
 import pytest
 
@@ -11,8 +11,6 @@ from league.errors import ParityError
 from league.registry.registry import Registry
 from league.registry.storage import rows
 from league.registry.storage.rows import RunRow
-from league.settings import Storage
-from tests.support.leagues.registries import interface
 from tests.support.leagues.training_leagues import tictactoe
 from tests.support.waiting import until
 from training.runs import run_reporter
@@ -23,14 +21,10 @@ from training.runs.tune import Interrupted
 LEAGUE = tictactoe(steps=1000, lr=0.01)
 
 
-@pytest.fixture
-def registry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Registry]:
+@pytest.fixture(autouse=True)
+def intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_reporter, "RETRY_SECONDS", 0.01)
     monkeypatch.setattr(run_reporter, "FINAL_REPORT_SECONDS", 240.0)  # the machine may be busy
-    opened = Registry.open(Storage.at(tmp_path / "home"))
-    opened.leagues.register(LEAGUE, interface())
-    yield opened
-    opened.close()
 
 
 @pytest.fixture
@@ -44,25 +38,23 @@ def recorded(registry: Registry, run: RunDirectory) -> RunRow:
 
 def result(steps: int, **curves: object) -> dict[str, object]:
     """A result of Tune, with its own fields."""
-    return {
-        "steps": steps,
-        "seconds": steps / 10,
-        "timesteps_total": 5000 + steps,
-        "training_iteration": 1,
-        "pid": 7,
-        "date": "today",
-        "done": False,
-        "config": {"lr": 1},
-        "agents/player_1/return": 0.5,
-        "agents/player_1/length": 5.0,
-    } | curves
+    of_tune = {"timesteps_total": 5000 + steps, "training_iteration": 1, "pid": 7, "date": "today", "done": False}
+    of_agents = {"agents/player_1/return": 0.5, "agents/player_1/length": 5.0}
+    return {"steps": steps, "seconds": steps / 10, "config": {"lr": 1}} | of_tune | of_agents | curves
+
+
+@contextmanager
+def reporting(registry: Registry, run: RunDirectory) -> Iterator[RunReporter]:
+    """A reporter of a run that has begun."""
+    with RunReporter(registry, run) as reporter:
+        reporter.begin(0, 0.0)
+        until(lambda: registry.runs.counts() == {"tictactoe": 1})
+        yield reporter
 
 
 def drive(registry: Registry, run: RunDirectory, reports: list[int], end: BaseException) -> None:
     """Training that reports at these steps, each time after the previous report was recorded."""
-    with RunReporter(registry, run) as reporter:
-        reporter.begin(0, 0.0)
-        until(lambda: registry.runs.counts() == {"tictactoe": 1})
+    with reporting(registry, run) as reporter:
         for steps in reports:
             reporter.report(result(steps, loss=1.0))
             until(lambda steps=steps: recorded(registry, run).steps == steps)
@@ -80,14 +72,12 @@ def test_a_second_attempt_continues_the_record(
             until(lambda start=start: registry.runs.counts() and recorded(registry, run).steps == start)
             reporter.report(result(reached, loss=1.0))
             until(lambda reached=reached: recorded(registry, run).steps == reached)
-    found = recorded(registry, run)
-    assert (found.attempts, found.steps, found.state) == (2, 250, "ended")
+    row = recorded(registry, run)
+    assert (row.attempts, row.steps, row.state) == (2, 250, "ended")
 
 
 def test_settings_and_curves_are_recorded(registry: Registry, run: RunDirectory) -> None:
-    with RunReporter(registry, run) as reporter:
-        reporter.begin(0, 0.0)
-        until(lambda: registry.runs.counts() == {"tictactoe": 1})
+    with reporting(registry, run) as reporter:
         started = recorded(registry, run)
         assert (started.algorithm, started.seed, started.target, started.parent) == ("ppo", 5, 1000, 3)
         assert (started.settings["lr"], started.settings["hidden"]) == (0.01, [16])
@@ -121,9 +111,7 @@ def test_reports_faster_than_the_registry_are_merged(
         record(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(registry.runs, "record", record_slowly)
-    with RunReporter(registry, run) as reporter:
-        reporter.begin(0, 0.0)
-        until(lambda: registry.runs.counts() == {"tictactoe": 1})
+    with reporting(registry, run) as reporter:
         reporter.report(result(100, **{"return": 1.0, "loss": 0.5}))
         reporter.report(result(200, **{"return": 2.0}))
         resume.set()
@@ -168,9 +156,7 @@ def test_heartbeats_continue_without_new_reports(
 ) -> None:
     assert rows.HEARTBEAT_TIMEOUT.total_seconds() > 3 * run_reporter.HEARTBEAT_SECONDS
     monkeypatch.setattr(run_reporter, "HEARTBEAT_SECONDS", 0.01)
-    with RunReporter(registry, run) as reporter:
-        reporter.begin(0, 0.0)
-        until(lambda: registry.runs.counts() == {"tictactoe": 1})
+    with reporting(registry, run):
         first = recorded(registry, run).heartbeat_at
         until(lambda: recorded(registry, run).heartbeat_at > first)
 

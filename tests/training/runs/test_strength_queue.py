@@ -1,20 +1,26 @@
-"""Versions are measured in order beside training; errors do not end the run, and an interruption loses nothing."""
+"""Checkpoints are published in order beside training, and versions are measured; an interruption loses nothing."""
 
 import io
 import threading
 from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from league.config.league import LeagueConfig
-from league.errors import GameHung
+from league.errors import ArtifactCorrupt, GameHung
 from league.registry.registry import Registry
 from league.registry.storage.rows import StrengthRow, VersionRow
 from tests.support.leagues.registries import LEAGUE, publish
 from tests.support.leagues.training_leagues import tictactoe
+from training.runs import publish_queue
+from training.runs.checkpoint_digests import write_digests
 from training.runs.progress import TrainingProgress
+from training.runs.publish_queue import PublishQueue
 from training.runs.run_directory import RunDirectory
 from training.runs.strength_queue import Measure, StrengthQueue
 
@@ -39,21 +45,9 @@ class Run:
         self.measured.append((version.number, games))
         if version.number == 2:
             raise GameHung("a game did not end")
-        now = datetime.now(UTC)
-        return [
-            StrengthRow(
-                league=version.league,
-                version=version.number,
-                opponent="script:random",
-                run=version.run,
-                steps=100 * version.number,
-                games=games,
-                score=0.75,
-                low=0.5,
-                high=0.875,
-                at=now,
-            )
-        ]
+        scores: dict[str, Any] = {"games": games, "score": 0.75, "low": 0.5, "high": 0.875, "at": datetime.now(UTC)}
+        identity: dict[str, Any] = {"league": version.league, "version": version.number, "run": version.run}
+        return [StrengthRow(**identity, **scores, opponent="script:random", steps=100 * version.number)]
 
     def recorded(self) -> list[tuple[int, str]]:
         return [(row.version, row.opponent) for row in self.registry.strength.of_run(LEAGUE, self.directory.id)]
@@ -72,10 +66,8 @@ def test_scores_are_recorded_shown_and_plotted(registry: Registry) -> None:
     events = EventAccumulator(str(run.directory.path / "strength"))
     events.Reload()
     for name, value in (("score", 0.75), ("low", 0.5), ("high", 0.875)):
-        assert [(each.step, each.value) for each in events.Scalars(f"strength/script_random/{name}")] == [
-            (100, value),
-            (300, value),
-        ]
+        points = events.Scalars(f"strength/script_random/{name}")
+        assert [(point.step, point.value) for point in points] == [(100, value), (300, value)]
 
 
 def test_a_resumed_run_measures_what_was_not_measured(registry: Registry) -> None:
@@ -112,3 +104,64 @@ def test_nothing_is_measured_unless_it_is_wanted_and_possible(
         queue.join()
     assert run.measured == []
     assert run.recorded() == []
+
+
+@pytest.fixture
+def published(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Versions of the run, with `parent` as passed to `publish`. A checkpoint named 666 cannot be exported."""
+    versions: list[Any] = []
+
+    def publish(checkpoint: Any, *, parent: int | None, **_: Any) -> Any:
+        if checkpoint.steps == 666:
+            raise RuntimeError("no export")
+        versions.append(SimpleNamespace(number=len(versions) + 1, steps=checkpoint.steps, parent=parent))
+        return versions[-1]
+
+    monkeypatch.setattr(publish_queue, "publish", publish)
+    monkeypatch.setattr(publish_queue, "published_versions", lambda *_: list(versions))
+    return versions
+
+
+def queue_of(parent: int | None = None) -> PublishQueue:
+    run: Any = SimpleNamespace(
+        id="run", record=SimpleNamespace(config=None, parent=parent, git_commit=None, exploits=None)
+    )
+    unused: Any = None
+    return PublishQueue(run, unused, unused, announce=lambda row: None)
+
+
+def checkpoints(directory: Path, *steps: int) -> list[Path]:
+    paths = [directory / str(number) for number in steps]
+    for path in paths:
+        path.mkdir()
+        (path / "state.pkl").write_bytes(b"weights")
+        write_digests(path)
+    return paths
+
+
+def test_each_version_has_the_one_before_as_its_parent(published: list[Any], tmp_path: Path) -> None:
+    paths, queue = checkpoints(tmp_path, 512, 1024, 1536, 2048), queue_of(parent=7)
+    for path in paths:
+        queue.add(path)
+    queue.join()
+    assert [(version.steps, version.parent) for version in published] == [(512, 7), (1024, 1), (1536, 2), (2048, 3)]
+    assert not any(path.exists() for path in paths), "published checkpoints are deleted"
+
+
+def test_nothing_is_published_after_a_failure(published: list[Any], tmp_path: Path) -> None:
+    paths, queue = checkpoints(tmp_path, 512, 666, 1024), queue_of()
+    for path in paths:
+        queue.add(path)
+    with pytest.raises(RuntimeError, match="no export"):
+        queue.join()
+    assert [version.steps for version in published] == [512]
+    assert [path.exists() for path in paths] == [False, True, True], "later checkpoints remain on disk"
+
+
+def test_a_damaged_checkpoint_is_not_published(published: list[Any], tmp_path: Path) -> None:
+    paths, queue = checkpoints(tmp_path, 512), queue_of()
+    (paths[0] / "state.pkl").write_bytes(b"weight5")
+    queue.add(paths[0])
+    with pytest.raises(ArtifactCorrupt, match=r"512/state\.pkl was changed"):
+        queue.join()
+    assert published == []

@@ -1,10 +1,15 @@
+"""Where a run is placed, and what is said about its errors, which pass through several processes."""
+
+from pathlib import Path
+
 import pytest
 import ray
 
 from league import ray_cluster
-from league.errors import ConfigError
+from league.errors import ConfigError, InvalidReward
 from training.algorithms.resources import Resources
 from training.runs import tune
+from training.runs.error_messages import training_error
 from training.runs.tune import cpu_share, placement
 
 
@@ -23,7 +28,7 @@ def using(runners: int, gpus: float = 0.0, runner_gpus: float = 0.0, learners: i
 
 
 def machines(monkeypatch: pytest.MonkeyPatch, *resources: dict[str, float]) -> None:
-    nodes = [{"Alive": True, "NodeID": str(place), "Resources": each} for place, each in enumerate(resources)]
+    nodes = [{"Alive": True, "NodeID": str(place), "Resources": of_node} for place, of_node in enumerate(resources)]
     monkeypatch.setattr(ray, "nodes", lambda: nodes)
     monkeypatch.setattr(ray_cluster, "draining_nodes", set)
     monkeypatch.setattr(tune, "has_autoscaler", lambda: False)
@@ -59,7 +64,7 @@ def test_each_learner_requests_its_resources(monkeypatch: pytest.MonkeyPatch) ->
 def test_every_share_fits_on_a_node(
     cpus: tuple[float, ...], runners: int, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machines(monkeypatch, *({"CPU": each} for each in cpus))
+    machines(monkeypatch, *({"CPU": number} for number in cpus))
     assert cpu_share(1 + runners) == share
     assert len(placement(using(runners=runners), share).bundles) == runners + 1
 
@@ -74,3 +79,45 @@ def test_what_no_node_has_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     machines(monkeypatch, {"CPU": 2.0, "GPU": 1.0}, {"CPU": 2.0, "GPU": 1.0})
     with pytest.raises(ConfigError, match=r"3 runners need 0\.5 CPUs and 0\.4 GPUs each"):
         placement(using(runners=3, gpus=0.75, runner_gpus=0.4), 0.5)
+
+
+TRACE = Path("/runs/error.txt")
+
+
+def through_processes(fault: Exception) -> BaseException:
+    """The exception that the driver gets if a task of a task raises."""
+
+    @ray.remote(num_cpus=0.1)
+    def runner() -> None:
+        raise fault
+
+    @ray.remote(num_cpus=0.1)
+    def learner() -> None:
+        ray.get(runner.remote())
+
+    with pytest.raises(type(fault)) as raised:
+        ray.get(learner.remote())
+    return raised.value
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_our_errors_are_unchanged() -> None:
+    error = training_error(through_processes(InvalidReward("league a: player_1: nan")), "a", TRACE)
+    assert type(error) is InvalidReward
+    assert str(error) == "league a: player_1: nan"
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_other_errors_have_type_message_line_of_the_user_code_and_episode() -> None:
+    fault = KeyError("ball\nand more")
+    fault.add_note("in the episode with seed 7")
+    error = training_error(through_processes(fault), "a", TRACE)
+    line = next(n for n, text in enumerate(Path(__file__).read_text().splitlines(), 1) if "raise fault" in text)
+    assert str(error).startswith("league a: training failed with KeyError: 'ball\\nand more' at ")
+    assert str(error).endswith(f"{__file__}:{line} in the episode with seed 7; see the traceback in /runs/error.txt")
+
+
+def test_an_error_without_message_or_line() -> None:
+    assert str(training_error(MemoryError(), "a", TRACE)) == (
+        "league a: training failed with MemoryError; see the traceback in /runs/error.txt"
+    )

@@ -7,17 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError
 from league.random.seeds import generator
 from tests.support.environments import scripted_environment
 from tests.support.environments.scripted_environment import Scripted
 from tests.support.leagues.training_leagues import counting, solvable
+from tests.support.learners import episodes_of
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, forward
-from training.algorithms.rllib_config import algorithm_config
 from training.sampling.central_observations import PRESENT, STATE, central_space
-from training.sampling.env_runner import BatchedEnvRunner
 from training.sampling.episode_chunks import EpisodeChunks
 from training.sampling.recorder import EpisodeRecorder
 from training.sampling.reset_seeds import ResetSeeds
@@ -26,21 +24,13 @@ from training.sampling.self_play import SelfPlay
 TWO: Any = {"a": ["player_0"], "b": ["player_1"]}
 
 
-def sampled(league: LeagueConfig, steps: int) -> list[EpisodeChunks]:
-    runner = BatchedEnvRunner(config=algorithm_config(league, interface(league)), worker_index=0)
-    try:
-        return runner.sample_chunks(num_timesteps=steps)
-    finally:
-        runner.stop()
-
-
 @given(
     agents=st.integers(2, 4),
     num_envs=st.integers(1, 3),
     crashing=st.sampled_from([0.0, 0.3]),
     fragment_lengths=FRAGMENT_LENGTHS,
 )
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_others_are_of_the_same_episode_and_absent_ones_are_zeros(
     agents: int, num_envs: int, crashing: float, fragment_lengths: list[int]
 ) -> None:
@@ -61,19 +51,21 @@ def check(chunks: EpisodeChunks, env: Scripted) -> None:
     number = np.repeat(chunks.agents, chunks.lengths + 1)
     observed, present = chunks.observations["observation"], chunks.central[PRESENT]
     for agent, name in enumerate(env.agents):
-        column, here = chunks.central[f"central/{name}/observation"], present[:, agent] == 1
+        column, is_present = chunks.central[f"central/{name}/observation"], present[:, agent] == 1
         np.testing.assert_array_equal(column[number == agent], observed[number == agent])
-        assert here[number == agent].all()
-        np.testing.assert_array_equal(column[here, :2], np.stack([np.full(here.sum(), agent), observed[here, 1]], 1))
-        assert not column[~here].any()
-        for seed, rows in zip(observed[here, 1].tolist(), column[here, 2].tolist(), strict=True):
+        assert is_present[number == agent].all()
+        np.testing.assert_array_equal(
+            column[is_present, :2], np.stack([np.full(is_present.sum(), agent), observed[is_present, 1]], 1)
+        )
+        assert not column[~is_present].any()
+        for seed, rows in zip(observed[is_present, 1].tolist(), column[is_present, 2].tolist(), strict=True):
             assert rows <= len(env.played[int(seed)].agents[agent].groups)
 
 
 def test_in_a_turn_based_game_others_are_as_at_their_last_turns() -> None:
     """Before its first turn a player is absent, as it is after it has left."""
     league = counting([3, 4], [1], critic="central", num_envs=1, gamma=1.0)
-    first, second = sampled(league, 12)
+    first, second = episodes_of(league, steps=12)
     steps = first.lengths[0] + 1
     assert first.observations["observation"][:steps, 1].tolist() == [0, 1, 2, 3]
     # The row in which player_0 leaves has what player_1 observes then.
@@ -88,7 +80,7 @@ def test_in_a_turn_based_game_others_are_as_at_their_last_turns() -> None:
 @pytest.mark.parametrize("critic", ["central", "state"])
 def test_agents_that_act_at_once_see_each_other_at_the_same_time(critic: str) -> None:
     """Also after the last step of an episode, where the state is not that of the next episode."""
-    a, b = sampled(solvable("watching", policies=TWO, critic=critic, num_envs=3), 40)
+    a, b = episodes_of(solvable("watching", policies=TWO, critic=critic, num_envs=3), steps=40)
     pair = np.stack([a.observations["observation"], b.observations["observation"]], 1)
     for chunks in (a, b):
         assert chunks.truncated.any()
@@ -101,7 +93,7 @@ def test_agents_that_act_at_once_see_each_other_at_the_same_time(critic: str) ->
 
 
 def test_nothing_is_recorded_for_a_critic_of_its_own_agent() -> None:
-    assert all(not chunks.central for chunks in sampled(solvable("watching"), 16))
+    assert all(not chunks.central for chunks in episodes_of(solvable("watching"), steps=16))
 
 
 def test_an_environment_without_a_state_is_rejected() -> None:

@@ -1,14 +1,11 @@
 """Episodes with everything the protocol allows, as transitions, and joint transitions of simultaneous agents."""
 
 from collections import defaultdict
-from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pettingzoo import ParallelEnv
 
 from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
@@ -19,7 +16,7 @@ from league.errors import EnvironmentMismatch
 from league.random.seeds import generator
 from tests.support.environments.scripted_environment import AgentRecord, Scripted, interface
 from tests.support.examples import examples
-from tests.support.leagues.training_leagues import tictactoe
+from tests.support.leagues.training_leagues import small, tictactoe
 from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, forward
 from training.replay_buffer import NEXT, TransitionBlock
 from training.sampling.closed_transitions import (
@@ -61,7 +58,7 @@ def expected_rows(seed: int, agent: int, record: AgentRecord) -> list[tuple[obje
     opponents=st.sampled_from([[], [RANDOM]]),
     fragment_lengths=FRAGMENT_LENGTHS,
 )
-@examples(100)
+@examples(75)
 def test_each_transition_is_recorded_once_with_its_successor(
     agents: int,
     num_envs: int,
@@ -76,7 +73,7 @@ def test_each_transition_is_recorded_once_with_its_successor(
     recorder = PolicyTransitions(interface_of_league, env.agents, num_envs)
     play = SelfPlay(env, interface_of_league, config, recorder, INITIAL, opening_plies=plies)
     play.begin(ResetSeeds.of_run(3, num_envs=num_envs, **RUNNER), generator(3, "play"))
-    found, streams = defaultdict(list), {}
+    recorded, streams = defaultdict(list), {}
     for steps in fragment_lengths:
         for _ in range(steps):
             play.step(forward, explore=True)
@@ -87,16 +84,16 @@ def test_each_transition_is_recorded_once_with_its_successor(
                 assert policy == f"policy_{agent % 2}"
                 assert row[f"{NEXT}{OBSERVATIONS}/observation"].tolist() == [agent, seed, number + 1]
                 assert row[f"{OBSERVATIONS}/action_mask"][row[ACTIONS]]
-                found[seed, agent].append(((agent, seed, number), row[REWARDS], row[TERMINATED], row[TRUNCATED]))
+                recorded[seed, agent].append(((agent, seed, number), row[REWARDS], row[TERMINATED], row[TRUNCATED]))
                 # A row continues the latest row of its stream, which must be its predecessor, or starts an episode.
                 assert block.firsts[i] or streams[policy, block.streams[i]] == (seed, agent, number - 1)
                 streams[policy, block.streams[i]] = (seed, agent, number)
     for seed, played in env.played.items():
-        for agent, seen in played.agents.items():
-            expected = expected_rows(seed, agent, seen)
-            own = found.pop((seed, agent), [])
-            assert own == expected[: len(own)] if played.is_lost else own == expected
-    assert not found
+        for agent, record in played.agents.items():
+            expected = expected_rows(seed, agent, record)
+            rows = recorded.pop((seed, agent), [])
+            assert rows == expected[: len(rows)] if played.is_lost else rows == expected
+    assert not recorded
 
 
 def joint(league: LeagueConfig, steps: int, num_envs: int = 2) -> TransitionBlock:
@@ -120,42 +117,10 @@ def joint(league: LeagueConfig, steps: int, num_envs: int = 2) -> TransitionBloc
         env.close()
 
 
-class Leaving(ParallelEnv):
-    """Agent i leaves after i + 2 steps, the second one truncated; it observes the number of steps."""
-
-    possible_agents = ("player_0", "player_1")
-
-    def observation_space(self, agent: str) -> gymnasium.Space:
-        return gymnasium.spaces.Box(0, 9, (1 + self.possible_agents.index(agent),), np.float32)
-
-    def action_space(self, agent: str) -> gymnasium.Space:
-        return gymnasium.spaces.Discrete(2)
-
-    def reset(self, seed: int | None = None, options: Any = None) -> Any:
-        self.agents, self._steps = list(self.possible_agents), 0
-        return self._observations(), {agent: {} for agent in self.agents}
-
-    def step(self, actions: dict[str, int]) -> Any:
-        self._steps += 1
-        terminated = {agent: agent == "player_0" and self._steps == 2 for agent in self.agents}
-        truncated = {agent: agent == "player_1" and self._steps == 3 for agent in self.agents}
-        seen, rewards = self._observations(), dict.fromkeys(self.agents, float(self._steps))
-        self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
-        return seen, rewards, terminated, truncated, {agent: {} for agent in seen}
-
-    def _observations(self) -> dict[str, Any]:
-        spaces = {agent: self.observation_space(agent) for agent in self.agents}
-        return {agent: np.full(space.shape, self._steps, np.float32) for agent, space in spaces.items()}
-
-
 def leaving() -> LeagueConfig:
-    return LeagueConfig.from_mapping(
-        {
-            "league": "leaving",
-            "environment": {"entry_point": f"{__name__}:Leaving"},
-            "policies": {"policy_0": ["player_0"], "policy_1": ["player_1"]},
-        }
-    )
+    """Agent i leaves after i + 2 steps, the second one truncated."""
+    policies = {f"policy_{i}": [f"agent_{i}"] for i in range(2)}
+    return small("tests.support.environments.simultaneous:meeting", {"leaves": [2, 3], "truncated": [1]}, policies)
 
 
 def test_joint_rows_of_agents_that_leave_at_different_times() -> None:
@@ -167,25 +132,25 @@ def test_joint_rows_of_agents_that_leave_at_different_times() -> None:
     assert rows[f"{TERMINATED}/policy_0"][:, 0].tolist() == [False, True, False] * 2
     assert rows[f"{TRUNCATED}/policy_1"][:, 0].tolist() == [False, False, True] * 2
     assert not rows[f"{TERMINATED}/policy_1"].any()
-    assert rows[f"{REWARDS}/policy_0"][:, 0].tolist() == [1, 2, 0] * 2
-    assert rows[STATE].tolist() == [[0, 0, 0], [1, 1, 1], [0, 2, 2]] * 2
-    assert rows[NEXT + STATE].tolist() == [[1, 1, 1], [2, 2, 2], [0, 3, 3]] * 2
+    assert rows[f"{REWARDS}/policy_0"][:, 0].tolist() == [1, 1, 0] * 2
+    # The number of each agent and of its step.
+    assert rows[STATE][:, [0, 1, 3, 4]].tolist() == [[0, 0, 1, 0], [0, 1, 1, 1], [0, 0, 1, 2]] * 2
+    assert rows[NEXT + STATE][:, [0, 1, 3, 4]].tolist() == [[0, 1, 1, 1], [0, 2, 1, 2], [0, 0, 1, 3]] * 2
+    assert not rows[STATE][[2, 5], :3].any()
     assert block.firsts[::2].tolist() == [True, False, False] * 2
-    assert state_size(leaving().environment, interface_of(leaving())) == 3
+    assert state_size(leaving().environment, interface_of(leaving())) == 6
 
 
 def test_joint_rows_have_the_last_state_of_an_episode() -> None:
     """simple_spread: the state is all observations, and an episode is truncated after 25 steps."""
-    league = LeagueConfig.from_mapping({"league": "spread", "environment": {"entry_point": "mpe2.simple_spread_v3"}})
+    league = small("mpe2.simple_spread_v3")
     block = joint(league, steps=30, num_envs=1)
     observations, next_observations = (block.rows[f"{head}{OBSERVATIONS}/shared/observation"] for head in ("", NEXT))
     np.testing.assert_array_equal(block.rows[STATE], observations.reshape(30, -1))
     np.testing.assert_array_equal(block.rows[NEXT + STATE], next_observations.reshape(30, -1))
     assert np.flatnonzero(block.firsts).tolist() == [0, 25]
     assert np.flatnonzero(block.rows[f"{TRUNCATED}/shared"].all(axis=1)).tolist() == [24]
-    assert not np.array_equal(next_observations[24], observations[25]), (
-        "the next observation is the last one of the episode"
-    )
+    assert not np.array_equal(next_observations[24], observations[25]), "the last one of the episode"
     assert state_size(league.environment, interface_of(league)) == 54
 
 

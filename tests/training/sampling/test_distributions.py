@@ -36,16 +36,18 @@ def expected(space: Space, inputs: np.ndarray, raw: np.ndarray) -> tuple[np.ndar
         parts = np.split(inputs, np.cumsum(NVEC)[:-1], axis=1)
         pairs = [expected(Discrete(n=n), part, raw[:, i]) for i, (n, part) in enumerate(zip(NVEC, parts, strict=True))]
         return sum(pair[0] for pair in pairs), sum(pair[1] for pair in pairs)
-    found = torch_distribution(space, inputs)
-    return found.log_prob(torch.from_numpy(raw)).numpy(), found.entropy().numpy()
+    reference = torch_distribution(space, inputs)
+    return reference.log_prob(torch.from_numpy(raw)).numpy(), reference.entropy().numpy()
 
 
 @pytest.mark.parametrize(("space", "d"), SPACES, ids=lambda value: getattr(value, "type", None))
-@given(seed=seeds, rows=st.integers(1, 7))
-@settings(deadline=None, max_examples=25)
-def test_probabilities_and_entropies_equal_torch(space: Space, d: int, seed: int, rows: int) -> None:
+@given(seed=seeds, rows=st.integers(1, 7), masked=st.booleans())
+@settings(max_examples=25)
+def test_probabilities_and_entropies_equal_torch(space: Space, d: int, seed: int, rows: int, masked: bool) -> None:
     rng = np.random.default_rng(seed)
     sampler, inputs = distribution(space), rng.normal(size=(rows, d)).astype(np.float32)
+    if masked and not isinstance(space, Box):
+        inputs[:, 1] = MASKED_LOGIT
     for raw, log_p in (sampler.sample(inputs, rng), sampler.mode(inputs)):
         log_probabilities, entropies = expected(space, inputs, raw)
         assert log_p.dtype == np.float32
@@ -104,22 +106,6 @@ def test_unsupported_spaces_are_rejected() -> None:
         distribution(Box(dtype="int32", shape=(2,), low=0, high=5))
 
 
-def test_log_softmax_of_masked_logits() -> None:
-    found = distributions.log_softmax(np.array([[0.0, np.log(3), -1e9]], np.float32))
-    np.testing.assert_allclose(np.exp(found), [[0.25, 0.75, 0.0]], atol=1e-6)
-    assert found.dtype == np.float32
-
-
-def test_samples_follow_the_distribution() -> None:
-    p = np.array([0.5, 0.3, 0.2, 0.0])
-    with np.errstate(divide="ignore"):
-        log_p = np.maximum(np.log(p), -1e9).astype(np.float32)
-    samples = distributions.sample(np.tile(log_p, (20_000, 1)), np.random.default_rng(1))
-    counts = np.bincount(samples, minlength=4)
-    assert counts[3] == 0
-    assert chisquare(counts[:3], 20_000 * p[:3]).pvalue > 1e-3
-
-
 def test_masked_actions_are_not_sampled_if_the_noise_is_zero() -> None:
     class Zeros:
         def standard_exponential(self, shape: tuple[int, ...], dtype: type) -> np.ndarray:
@@ -127,13 +113,6 @@ def test_masked_actions_are_not_sampled_if_the_noise_is_zero() -> None:
 
     log_p = np.array([[-1e9, -0.7, -0.7]], np.float32)
     assert distributions.sample(log_p, Zeros()) == [1]  # type: ignore[arg-type]
-
-
-def test_entropy_in_nats() -> None:
-    uniform = distributions.log_softmax(np.zeros((1, 4), np.float32))
-    certain = distributions.log_softmax(np.array([[0.0, -1e9]], np.float32))
-    np.testing.assert_allclose(distributions.entropy(uniform), [np.log(4)], rtol=1e-6)
-    assert distributions.entropy(certain).tolist() == pytest.approx([0.0])
 
 
 THETA, SIGMA = 0.15, 0.2

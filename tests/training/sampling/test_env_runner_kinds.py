@@ -1,7 +1,9 @@
-"""The runner in each kind of environment and with each kind of policy: its chunks equal the outputs of the module."""
+"""The runner in each kind of environment, with each kind of policy, and with vectorised and stock environments."""
 
 import logging
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +25,26 @@ from ray.rllib.utils.metrics import (
 from league.config.league import LeagueConfig
 from league.environments import lockstep
 from league.environments.building import interface
+from league.environments.lockstep import stock_stepping
+from league.environments.stepping import BatchedEnvironment
+from league.environments.vector_stepping import VectorStepping
 from league.errors import ConfigError, InvalidReward
 from league.policies.actions import to_environment
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces.conversion import to_gymnasium
-from tests.support.environments.cases import CASES, Case
+from tests.support.environments.cases import CASES
 from tests.support.environments.simultaneous import Simultaneous
 from tests.support.leagues import registries
-from tests.support.leagues.training_leagues import counting, solvable, tictactoe
+from tests.support.leagues.training_leagues import counting, small, solvable, tictactoe
+from tests.support.learners import equal, learner_of, update
 from tests.support.policies.graphs import masked_mlp
 from training.algorithms.rllib_config import algorithm_config
+from training.sampling import env_runner
 from training.sampling.env_runner import BatchedEnvRunner
+from training.sampling.episode_chunks import EpisodeChunks
 from training.sampling.opponents import Opponents
-from training.sampling.play_metrics import CRASHES, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
+from training.sampling.play_metrics import CRASHES, ENTROPY, EPISODE_AGENT_LEN_MEAN, EPISODE_MODULE_LEN_MEAN
 from training.sampling.reset_seeds import ResetSeeds
 from training.sampling.self_play import GAMES, OPPONENTS
 
@@ -44,38 +52,21 @@ MEETING = "tests.support.environments.simultaneous:meeting"
 RLLIB_MEETING = "tests.support.environments.simultaneous:rllib_meeting"
 
 
-def simultaneous(
-    entry_point: str, agents: int = 2, kwargs: dict[str, Any] | None = None, **training: Any
-) -> LeagueConfig:
+SMALL_SPREAD: dict[str, Any] = {"kwargs": {"max_cycles": 6}, "num_envs": 2}
+
+
+def simultaneous(entry_point: str, agents: int = 2, **options: Any) -> LeagueConfig:
     """Each agent has its own policy."""
-    return LeagueConfig.from_mapping(
-        {
-            "league": "together",
-            "environment": {"entry_point": entry_point, "kwargs": kwargs or {}},
-            "policies": {f"policy_{i}": [f"agent_{i}"] for i in range(agents)},
-            "training": {"runners": 0, "num_envs": 3, "hidden": [8], "seed": 5} | training,
-        }
-    )
+    policies = {f"policy_{i}": [f"agent_{i}"] for i in range(agents)}
+    return small(entry_point, policies=policies, name="together", **options)
 
 
 def spread(**training: Any) -> LeagueConfig:
-    return LeagueConfig.from_mapping(
-        {
-            "league": "spread",
-            "environment": {"entry_point": "mpe2.simple_spread_v3", "kwargs": {"max_cycles": 6}},
-            "training": {"runners": 0, "num_envs": 2, "hidden": [8], "seed": 5} | training,
-        }
-    )
+    return small("mpe2.simple_spread_v3", name="spread", **SMALL_SPREAD | training)
 
 
 def leduc(**training: Any) -> LeagueConfig:
-    return LeagueConfig.from_mapping(
-        {
-            "league": "leduc",
-            "environment": {"entry_point": "pettingzoo.classic.leduc_holdem_v4"},
-            "training": {"runners": 0, "num_envs": 3, "hidden": [8], "seed": 5} | training,
-        }
-    )
+    return small("pettingzoo.classic.leduc_holdem_v4", **training)
 
 
 def runner_of(league: LeagueConfig, storage: Storage | None = None) -> BatchedEnvRunner:
@@ -109,7 +100,7 @@ KINDS = {
     ),
     "rllib": simultaneous(RLLIB_MEETING),
     "fast seeds": leduc(seeds="fast"),
-    "early": simultaneous(MEETING, 3, {"arrives": [0, 1, 0], "leaves": [2, 4, 3], "truncated": [1]}),
+    "early": simultaneous(MEETING, 3, kwargs={"arrives": [0, 1, 0], "leaves": [2, 4, 3], "truncated": [1]}),
 }
 
 
@@ -143,16 +134,30 @@ def test_chunks_equal_the_outputs_of_the_module(league: LeagueConfig) -> None:
                 np.testing.assert_allclose(states[key][1:], after, atol=1e-5)
 
 
-@pytest.mark.parametrize("league", KINDS.values(), ids=KINDS)
+ENVIRONMENTS = {case.entry_point.rpartition(".")[2]: case.league() for case in CASES}
+
+
+@pytest.mark.parametrize("league", (KINDS | ENVIRONMENTS).values(), ids=KINDS | ENVIRONMENTS)
 def test_runners_reset_at_the_same_step_play_identically(league: LeagueConfig) -> None:
-    first, second = runner_of(league), runner_of(league)
-    first.sample(num_timesteps=37)
-    for runner in (first, second):
+    """Whatever was played before, in each environment of PettingZoo and mpe2: resumed training depends on it."""
+    runners = [runner_of(league) for _ in range(2)]
+    runners[0].sample(num_timesteps=37)
+    plays = []
+    for runner in runners:
         runner.reset_episodes(5000)
-    mine, theirs = ([columns(chunk) for chunk in runner.sample(num_timesteps=60)] for runner in (first, second))
-    assert mine == theirs
-    second.reset_episodes(5001)
-    assert [columns(chunk) for chunk in second.sample(num_timesteps=60)] != mine
+        plays.append([columns(chunk) for chunk in runner.sample(num_timesteps=40)])
+    assert plays[0] == plays[1]
+    for runner in runners:
+        runner.stop()
+
+
+def test_other_steps_and_seeds_give_other_play() -> None:
+    plays = []
+    for seed, steps in ((5, 5000), (5, 5001), (6, 5000)):
+        runner = runner_of(tictactoe(seed=seed))
+        runner.reset_episodes(steps)
+        plays.append([columns(chunk)["actions"] for chunk in runner.sample(num_timesteps=60)])
+    assert plays[0] not in plays[1:]
 
 
 def test_fast_seeds_change_the_episodes_of_training() -> None:
@@ -161,20 +166,6 @@ def test_fast_seeds_change_the_episodes_of_training() -> None:
         for seeds in ("fast", "stock")
     )
     assert fast != stock
-
-
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.entry_point.rpartition(".")[2])
-def test_a_reset_removes_the_history_of_the_environment(case: Case) -> None:
-    """Resumed training depends on it, in each environment of PettingZoo and mpe2."""
-    league = case.league()
-    first, second = runner_of(league), runner_of(league)
-    first.sample(num_timesteps=40)
-    for runner in (first, second):
-        runner.reset_episodes(5000)
-    mine, theirs = ([columns(chunk) for chunk in runner.sample(num_timesteps=40)] for runner in (first, second))
-    assert mine == theirs
-    for runner in (first, second):
-        runner.stop()
 
 
 def test_agents_that_join_late_and_leave_early_have_their_own_steps_and_endings() -> None:
@@ -189,14 +180,12 @@ def test_agents_that_join_late_and_leave_early_have_their_own_steps_and_endings(
     metrics = runner.get_metrics()
     assert metrics[EPISODE_LEN_MEAN].peek() == 4
     assert metrics[EPISODE_RETURN_MEAN].peek() == 2 + 30 + 300
-    assert {policy: stat.peek() for policy, stat in metrics[EPISODE_MODULE_RETURN_MEAN].items()} == {
-        "policy_0": 2.0,
-        "policy_1": 30.0,
-        "policy_2": 300.0,
-    }
+    returns = {policy: stat.peek() for policy, stat in metrics[EPISODE_MODULE_RETURN_MEAN].items()}
+    assert returns == {"policy_0": 2.0, "policy_1": 30.0, "policy_2": 300.0}
     assert metrics[EPISODE_AGENT_RETURN_MEAN]["agent_2"].peek() == 300
     assert metrics[EPISODE_AGENT_LEN_MEAN]["agent_2"].peek() == 3
     assert metrics[EPISODE_MODULE_LEN_MEAN]["policy_0"].peek() == 2
+    assert 0 < metrics["policy_0"][ENTROPY].peek() <= np.log(3) + 1e-6
 
 
 @pytest.mark.parametrize("plies", [0, 4])
@@ -207,7 +196,10 @@ def test_a_simultaneous_step_is_one_opening_ply(plies: int) -> None:
     for chunk in chunks:
         if chunk.is_done and chunk.t_started == 0:
             lengths[chunk.agent_id].add(len(chunk))
-    assert all(found == set(range(6 - plies, 7)) for found in lengths.values())
+    assert [*lengths.values()] == [set(range(6 - plies, 7))] * 3
+    metrics = runner.get_metrics()
+    learned = sum(stat.peek() for stat in metrics[NUM_MODULE_STEPS_SAMPLED].values())
+    assert (learned < metrics[NUM_ENV_STEPS_SAMPLED].peek()) == (plies > 0)
 
 
 def test_all_policies_act_in_one_pass_per_step() -> None:
@@ -217,12 +209,6 @@ def test_all_policies_act_in_one_pass_per_step() -> None:
     runner.module.encoder.register_forward_hook(lambda _, inputs, __: passes.append(len(inputs[0]["observation"])))
     runner.sample(num_timesteps=60)
     assert passes == [6] * 10
-
-
-def test_greedy_play_takes_the_mode() -> None:
-    for chunk in runner_of(KINDS["numbers"]).sample(num_timesteps=30, explore=False):
-        means = chunk.extra_model_outputs[Columns.ACTION_DIST_INPUTS].data[:, :2]
-        np.testing.assert_array_equal(chunk.actions.data, means)
 
 
 def test_sampling_preserves_the_number_of_threads() -> None:
@@ -236,7 +222,7 @@ def test_sampling_preserves_the_number_of_threads() -> None:
 
 
 def crashing(seeds: list[int], **training: Any) -> LeagueConfig:
-    return simultaneous(MEETING, 2, {"leaves": [4, 4], "crashes": seeds}, **training)
+    return simultaneous(MEETING, kwargs={"leaves": [4, 4], "crashes": seeds}, **training)
 
 
 def seeds_of_episodes(*places: tuple[int, int]) -> list[int]:
@@ -276,8 +262,8 @@ def test_an_invalid_reward_names_the_league(monkeypatch: pytest.MonkeyPatch) -> 
     step = Simultaneous.step
 
     def step_with_nan(self: Simultaneous, actions: dict[str, int]) -> tuple[dict, ...]:
-        seen, rewards, *flags = step(self, actions)
-        return seen, rewards | {"agent_1": float("nan")}, *flags
+        observations, rewards, *flags = step(self, actions)
+        return observations, rewards | {"agent_1": float("nan")}, *flags
 
     runner = runner_of(simultaneous(MEETING))
     monkeypatch.setattr(Simultaneous, "step", step_with_nan)
@@ -309,33 +295,30 @@ def test_environments_are_closed_and_rebuilt(monkeypatch: pytest.MonkeyPatch) ->
     assert len(closed) == 2
 
 
-def test_an_episode_has_one_member_of_a_mixture_as_opponent(tmp_path: Path) -> None:
-    storage = Storage.at(tmp_path)
-    registry = Registry.open(storage)
-    registry.leagues.register(registries.config(), registries.interface())
-    for seed in range(2):
-        build = registries.builder(graph=masked_mlp((3, 3, 2), actions=9, seed=seed))
-        registry.publisher.publish("tictactoe", build, source=f"run/{seed}", parent=None)
+@pytest.fixture
+def registry(tmp_path: Path) -> Iterator[Registry]:
+    """With two versions."""
+    with closing(Registry.open(Storage.at(tmp_path))) as registry:
+        registry.leagues.register(registries.config(), registries.interface())
+        for seed in range(2):
+            build = registries.builder(graph=masked_mlp((3, 3, 2), actions=9, seed=seed))
+            registry.publisher.publish("tictactoe", build, source=f"run/{seed}", parent=None)
+        yield registry
+
+
+def test_an_episode_has_one_member_of_a_mixture_as_opponent(registry: Registry) -> None:
     mixture = registry.publisher.publish_mixture("tictactoe", {1: 0.25, 2: 0.75})
-    registry.close()
-    runner = runner_of(tictactoe(opponents=[{"ref": mixture.ref, "share": 1.0}]), storage)
+    runner = runner_of(tictactoe(opponents=[{"ref": mixture.ref, "share": 1.0}]), registry.storage)
     runner.sample(num_episodes=200)
-    played = runner.get_metrics()[OPPONENTS]
-    games = {ref: values[GAMES].peek() for ref, values in played.items()}
+    games = {ref: values[GAMES].peek() for ref, values in runner.get_metrics()[OPPONENTS].items()}
     assert games.keys() == {"tictactoe@1", "tictactoe@2"}
     assert 0.1 < games["tictactoe@1"] / sum(games.values()) < 0.4
     runner.stop()
 
 
-def test_a_version_plays_the_other_side_with_exploration(tmp_path: Path) -> None:
+def test_a_version_plays_the_other_side_with_exploration(registry: Registry) -> None:
     """It is loaded once, even after a reset; its moves are in no chunk."""
-    storage = Storage.at(tmp_path)
-    registry = Registry.open(storage)
-    registry.leagues.register(registries.config(), registries.interface())
-    graph = masked_mlp((3, 3, 2), actions=9)
-    row = registry.publisher.publish("tictactoe", registries.builder(graph=graph), source="run/1", parent=None)
-    registry.close()
-    runner = runner_of(tictactoe(opponents=[{"ref": row.ref, "share": 1.0}]), storage)
+    runner = runner_of(tictactoe(opponents=[{"ref": "tictactoe@1", "share": 1.0}]), registry.storage)
     opponents = runner._play._opponents  # type: ignore[union-attr]
     assert isinstance(opponents, Opponents)
     chunks = runner.sample(num_episodes=20)
@@ -344,7 +327,59 @@ def test_a_version_plays_the_other_side_with_exploration(tmp_path: Path) -> None
     assert runner._play._opponents is opponents  # type: ignore[union-attr]
     assert {chunk.agent_id for chunk in chunks} == {"player_1", "player_2"}
     metrics = runner.get_metrics()
-    own = metrics[NUM_MODULE_STEPS_SAMPLED]["shared"].peek()
-    assert 0.4 < own / metrics[NUM_ENV_STEPS_SAMPLED].peek() < 0.6
+    recorded = metrics[NUM_MODULE_STEPS_SAMPLED]["shared"].peek()
+    assert 0.4 < recorded / metrics[NUM_ENV_STEPS_SAMPLED].peek() < 0.6
     # One agent of each episode learns.
     assert sum(chunk.is_done for chunk in chunks) == metrics[NUM_EPISODES].peek()
+
+
+VECTORISED: dict[str, tuple[str, dict[str, Any]]] = {
+    "opponents and openings": (
+        "pettingzoo.classic.tictactoe_v3",
+        {"opponents": [{"ref": "script:random", "share": 0.5}], "opening_plies": 2},
+    ),
+    "recurrent": ("pettingzoo.classic.connect_four_v3", {"recurrence": {"width": 4, "sequence": 3}}),
+    "simultaneous": ("mpe2.simple_spread_v3", {}),
+    "wrapped": ("mpe2.simple_tag_v3", {}),
+}
+
+WRAPPERS = ["pad_observations_v0", "agent_indicator_v0", {"frame_stack_v1": {"stack_size": 2}}, "clip_reward_v0"]
+
+
+def in_lockstep(*args: Any, fast_seeds: bool, **options: Any) -> BatchedEnvironment:
+    """`stepping`, without vectorised environments."""
+    assert not fast_seeds
+    return stock_stepping(*args, **options)
+
+
+def trained(league: LeagueConfig) -> tuple[list[list[EpisodeChunks]], dict[str, Any]]:
+    """Three samples with an update after each, and the final weights."""
+    config = algorithm_config(league, interface(league))
+    torch.manual_seed(0)
+    runner = BatchedEnvRunner(config, worker_index=0)
+    learner = learner_of(league)
+    samples = []
+    for _ in range(3):
+        runner.module.set_state(learner.module.get_state())
+        samples.append(runner.sample_chunks(num_timesteps=120))
+        update(learner, samples[-1], num_epochs=1, minibatch_size=32)
+    assert isinstance(runner.env, VectorStepping) == (env_runner.stepping is not in_lockstep)
+    runner.stop()
+    return samples, learner.module.get_state()
+
+
+@pytest.mark.parametrize("name", VECTORISED)
+def test_samples_and_weights_do_not_depend_on_the_implementation(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry_point, training = VECTORISED[name]
+    settings = {"runners": 0, "num_envs": 5, "hidden": [8], "train_batch_size": 120, "minibatch_size": 32}
+    environment = {"entry_point": entry_point, "wrappers": WRAPPERS if name == "wrapped" else []}
+    league = LeagueConfig.from_mapping({"league": "same", "environment": environment, "training": settings | training})
+    vectorised = trained(league)
+    monkeypatch.setattr(env_runner, "stepping", in_lockstep)
+    stock = trained(league)
+    for batches, stock_batches in zip(vectorised[0], stock[0], strict=True):
+        assert [chunks.policy for chunks in batches] == [chunks.policy for chunks in stock_batches]
+        for chunks, stock_chunks in zip(batches, stock_batches, strict=True):
+            for column in EpisodeChunks.__slots__:
+                assert equal(getattr(chunks, column), getattr(stock_chunks, column)), column
+    assert equal(vectorised[1], stock[1])

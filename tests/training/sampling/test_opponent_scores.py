@@ -23,22 +23,22 @@ TWO_SIDES = np.eye(2, dtype=bool)
 
 @given(GAMES)
 def test_games_are_scored_as_in_matches(games: list[tuple[float, float]]) -> None:
-    own, other = (np.array([game[i] for game in games]) for i in range(2))
+    returns, of_others = (np.array([game[i] for game in games]) for i in range(2))
     numbers = np.zeros(len(games), int)
-    found = OpposedGames(numbers, numbers, own, other[:, np.newaxis]).scores()
-    assert found.tolist() == [scores([game], "game")[0][0] for game in games]
+    results = OpposedGames(numbers, numbers, returns, of_others[:, np.newaxis]).scores()
+    assert results.tolist() == [scores([game], "game")[0][0] for game in games]
 
 
 @given(st.tuples(RETURNS, RETURNS), st.tuples(RETURNS, RETURNS))
 def test_two_games_form_a_block_if_sides_differ(first: tuple[float, float], second: tuple[float, float]) -> None:
-    own, other = np.array([second[0], first[0]]), np.array([[second[1]], [first[1]]])
-    block, waiting = OpposedGames(np.zeros(2, int), np.array([1, 0]), own, other).blocks()
+    returns, of_others = np.array([second[0], first[0]]), np.array([[second[1]], [first[1]]])
+    block, waiting = OpposedGames(np.zeros(2, int), np.array([1, 0]), returns, of_others).blocks()
     expected = scores([first, second], "side")
     assert len(waiting.own) == 0
     assert block.scores().sum() == sum(float(game[0] or 0) for game in expected)
     for opponents, sides in (([0, 0], [1, 1]), ([0, 1], [1, 0])):
-        block, waiting = OpposedGames(np.array(opponents), np.array(sides), own, other).blocks()
-        assert (len(block.own), sorted(waiting.own)) == (0, sorted(own))
+        block, waiting = OpposedGames(np.array(opponents), np.array(sides), returns, of_others).blocks()
+        assert (len(block.own), sorted(waiting.own)) == (0, sorted(returns))
 
 
 def rows(envs: list[int], agents: list[int], rewards: list[float]) -> AgentRows:
@@ -64,11 +64,11 @@ def test_rewards_of_an_episode_are_summed_for_both_sides() -> None:
         crashed=np.array([2]),
     )
     collected.add_turn(ended)
-    found = collected.take(2)
-    assert (found.games.tolist(), found.scores.tolist()) == ([1, 0], [1.0, 0.0])
+    results = collected.take(2)
+    assert (results.games.tolist(), results.scores.tolist()) == ([1, 0], [1.0, 0.0])
     collected.add_turn(Turn(endings=[rows([0, 0], [0, 1], [1.0, 1.0])], finished=np.array([0])))
-    found = collected.take(2)
-    assert (found.games.tolist(), found.scores.tolist()) == ([0, 1], [0.0, 0.5])
+    results = collected.take(2)
+    assert (results.games.tolist(), results.scores.tolist()) == ([0, 1], [0.0, 0.5])
 
 
 def play(collected: OpponentScores, opponents: list[int], sides: list[int], own: list[float]) -> OpponentResults:
@@ -82,27 +82,27 @@ def play(collected: OpponentScores, opponents: list[int], sides: list[int], own:
 
 def test_a_game_waits_for_its_partner() -> None:
     collected = OpponentScores(TWO_SIDES, "side", num_envs=2)
-    found = play(collected, [0, 1], [0, 1], [1.0, 1.0])
-    assert (found.episodes.tolist(), found.games.tolist()) == ([1, 1], [0, 0])
-    found = play(collected, [0, 0], [1, 1], [0.0, 5.0])
-    assert (found.episodes.tolist(), found.games.tolist(), found.scores.tolist()) == ([2, 0], [2, 0], [1.5, 0.0])
-    found = play(collected, [0, 1], [0, 0], [0.0, 0.0])
-    assert (found.episodes.tolist(), found.games.tolist(), found.scores.tolist()) == ([1, 1], [2, 2], [1.5, 1.5])
+    results = play(collected, [0, 1], [0, 1], [1.0, 1.0])
+    assert (results.episodes.tolist(), results.games.tolist()) == ([1, 1], [0, 0])
+    results = play(collected, [0, 0], [1, 1], [0.0, 5.0])
+    assert (results.episodes.tolist(), results.games.tolist(), results.scores.tolist()) == ([2, 0], [2, 0], [1.5, 0.0])
+    results = play(collected, [0, 1], [0, 0], [0.0, 0.0])
+    assert (results.episodes.tolist(), results.games.tolist(), results.scores.tolist()) == ([1, 1], [2, 2], [1.5, 1.5])
 
 
 def test_the_newest_games_wait() -> None:
     collected, many = OpponentScores(TWO_SIDES, "side", num_envs=40), [0] * 40
     returns = [0.0] * (40 - MOST_WAITING) + [1.0] * MOST_WAITING
     assert play(collected, many, many, returns).games.tolist() == [0, 0]
-    found = play(collected, many, [1] * 40, [1.0] * 40)
-    assert (found.games[0], found.scores[0]) == (2 * MOST_WAITING, 2 * MOST_WAITING), "all games with returns of 1"
+    results = play(collected, many, [1] * 40, [1.0] * 40)
+    assert (results.games[0], results.scores[0]) == (2 * MOST_WAITING, 2 * MOST_WAITING), "all games with returns of 1"
 
 
 @pytest.mark.parametrize(("scoring", "sides"), [("side", 3), ("team", 2)])
 def test_episodes_of_unscored_leagues_are_counted(scoring: Scoring, sides: int) -> None:
     collected = OpponentScores(np.eye(sides, dtype=bool), scoring, num_envs=3)
-    found = play(collected, [1, 1, -1], [0, 1, 0], [1.0, 1.0, 1.0])
-    assert (found.episodes.tolist(), found.games.tolist()) == ([0, 2], [0, 0])
+    results = play(collected, [1, 1, -1], [0, 1, 0], [1.0, 1.0, 1.0])
+    assert (results.episodes.tolist(), results.games.tolist()) == ([0, 2], [0, 0])
 
 
 @pytest.mark.parametrize("side", [0, 1, 2])
@@ -125,8 +125,8 @@ def test_equal_policies_score_a_half(sides: int) -> None:
     collected.begin(envs, np.zeros(sides, int), np.zeros(sides, int))
     collected.add_turn(Turn())
     collected.add_turn(Turn(endings=[rows(envs.tolist(), envs.tolist(), [1.0] * sides)], finished=envs))
-    found = collected.take(1)
-    assert (found.games.tolist(), found.scores.tolist()) == ([sides], [pytest.approx(sides / 2)])
+    results = collected.take(1)
+    assert (results.games.tolist(), results.scores.tolist()) == ([sides], [pytest.approx(sides / 2)])
 
 
 def test_opponents_forget_what_happened_in_earlier_episodes() -> None:

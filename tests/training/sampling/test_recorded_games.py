@@ -69,23 +69,23 @@ def test_each_agent_of_each_game_is_a_chunk(tmp_path: Path) -> None:
     assert chunks.rewards.tolist() == [1, 2, 4, 3, 5]
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
+def test_rows_that_do_not_fit_are_refused(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    rows: list[tuple[dict[str, Any], str]] = [
         ({"action": 7}, "1 actions are not legal by their action_mask"),
         ({"action": 8}, "action must be between 5 and 7"),
         ({"observation": [1.0, 2.0, 3.0]}, "observation has 15 numbers in 7 rows, expected 2 in each"),
         ({"observation": [1.0, float("nan")]}, "observation contains NaN"),
         ({"reward": None}, "reward has 1 values that are null"),
-        ({"action": "left"}, "action"),
-    ],
-)
-def test_rows_that_do_not_fit_are_refused(tmp_path: Path, changed: dict[str, Any], message: str) -> None:
-    rows = [*ROWS[:-1], ROWS[-1] | changed]
-    if isinstance(changed.get("action"), str):
-        rows = [decision | {"action": str(decision["action"])} for decision in rows]
-    with pytest.raises(ConfigError, match=rf"^training\.data: .*shared\.parquet: .*{message}"):
-        RecordedGames.read(written(tmp_path, rows), "shared", SPACES)
+    ]
+    for changed, message in rows:
+        with (
+            subtests.test(message),
+            pytest.raises(ConfigError, match=rf"^training\.data: .*shared\.parquet: .*{message}"),
+        ):
+            RecordedGames.read(written(tmp_path, [*ROWS[:-1], ROWS[-1] | changed]), "shared", SPACES)
+    texts = [decision | {"action": str(decision["action"])} for decision in ROWS]
+    with pytest.raises(ConfigError, match=r"^training\.data: .*shared\.parquet: .*action"):
+        RecordedGames.read(written(tmp_path, texts), "shared", SPACES)
 
 
 def test_a_file_without_decisions_is_refused(tmp_path: Path) -> None:

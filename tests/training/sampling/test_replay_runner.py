@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -13,17 +15,15 @@ OWN = {"a": ["player_0"], "b": ["player_1"]}
 DEVIATION = 0.2
 NUM_ENVS = 200
 
-pytestmark = pytest.mark.usefixtures("ray_session")
 
-
-def sample_rounds(theta: float | None) -> TransitionBlock:
-    """Four rounds in each environment, by actors with a mean of 0."""
-    league = maddpg("summing", {}, OWN, theta=theta, num_envs=NUM_ENVS)
-    runner = ActorRunner(config=algorithm_config(league, interface(league)), worker_index=0)
+def sample_rounds(rounds: int = 8, worker: int = 0, **training: Any) -> TransitionBlock:
+    """Rounds of two agents in each environment, by actors with a mean of 0."""
+    league = maddpg("summing", {}, OWN, num_envs=NUM_ENVS, **training)
+    runner = ActorRunner(config=algorithm_config(league, interface(league)), worker_index=worker)
     try:
         for module in runner.module.values():
             torch.nn.init.zeros_(module.head.weight)
-        _, blocks = runner.transitions(8 * NUM_ENVS * 2, DEVIATION)
+        _, blocks = runner.transitions(2 * rounds * NUM_ENVS, DEVIATION)
     finally:
         runner.stop()
     return blocks[JOINT]
@@ -35,7 +35,7 @@ def noise(block: TransitionBlock, agent: str) -> np.ndarray:
 
 
 def test_independent_noise_has_the_configured_deviation() -> None:
-    samples = noise(sample_rounds(None), "a")
+    samples = noise(sample_rounds(), "a")
     assert samples.std() == pytest.approx(DEVIATION, rel=0.1)
     assert abs(np.corrcoef(samples[0], samples[1])[0, 1]) < 0.25
 
@@ -45,15 +45,7 @@ def test_a_remote_runner_explores_by_its_seed() -> None:
 
     def sample(seed: int, state_of_process: int) -> np.ndarray:
         torch.manual_seed(state_of_process)
-        league = maddpg("summing", {}, OWN, seed=seed, num_envs=NUM_ENVS)
-        runner = ActorRunner(config=algorithm_config(league, interface(league)), worker_index=1)
-        try:
-            for module in runner.module.values():
-                torch.nn.init.zeros_(module.head.weight)
-            _, blocks = runner.transitions(8 * NUM_ENVS, DEVIATION)
-        finally:
-            runner.stop()
-        return noise(blocks[JOINT], "a")
+        return noise(sample_rounds(4, worker=1, seed=seed), "a")
 
     np.testing.assert_array_equal(sample(0, 1), sample(0, 2))
     assert (sample(0, 1) != sample(1, 1)).any()
@@ -76,7 +68,7 @@ def test_the_noise_of_a_remote_runner_depends_on_seed_and_steps_only() -> None:
 
 
 def test_ornstein_uhlenbeck_noise_continues_within_an_episode_only() -> None:
-    block = sample_rounds(0.15)
+    block = sample_rounds(theta=0.15)
     samples = noise(block, "a")
     assert np.corrcoef(samples[2], samples[3])[0, 1] > 0.6
     assert abs(np.corrcoef(samples[3], samples[4])[0, 1]) < 0.25, "noise restarts after four rounds"
@@ -86,6 +78,6 @@ def test_ornstein_uhlenbeck_noise_continues_within_an_episode_only() -> None:
 
 
 def test_rows_without_state_if_critics_do_not_use_it() -> None:
-    columns = sample_rounds(None).rows
+    columns = sample_rounds().rows
     assert "observations/b/observation" in columns
     assert not [name for name in columns if name.endswith("state")]

@@ -135,11 +135,11 @@ def test_later_resets_derive_their_seed_from_the_first() -> None:
     def seeds(env: LeagueEnv, first: int | None) -> list[int]:
         return [env.reset(seed=seed)[1]["agent_0"]["seed"] for seed in (first, None, None, None)]
 
-    found = seeds(env, 5)
-    assert found[0] == 5
-    assert len(set(found)) == 4
-    assert seeds(other, 5) == found
-    assert not set(seeds(third, None)) & set(found)
+    drawn = seeds(env, 5)
+    assert drawn[0] == 5
+    assert len(set(drawn)) == 4
+    assert seeds(other, 5) == drawn
+    assert not set(seeds(third, None)) & set(drawn)
 
 
 def test_the_environment_renders() -> None:

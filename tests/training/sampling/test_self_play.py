@@ -13,7 +13,6 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
 from league.errors import ConfigError
-from league.policies.actions import to_environment
 from league.random.seeds import generator
 from league.results.records import Scoring
 from tests.support.environments.scripted_environment import AgentRecord, EpisodeRecord, Scripted, interface
@@ -22,7 +21,7 @@ from tests.support.policies.self_play import FRAGMENT_LENGTHS, INITIAL, RANDOM, 
 from training.sampling.episode_chunks import as_episodes
 from training.sampling.opponents import OpponentPolicy
 from training.sampling.recorder import EpisodeRecorder
-from training.sampling.reset_seeds import ResetSeeds
+from training.sampling.reset_seeds import SEEDS, ResetSeeds
 from training.sampling.self_play import ForwardInput, SelfPlay
 
 
@@ -59,15 +58,12 @@ def cut(play: SelfPlay) -> list[SingleAgentEpisode]:
 
 def by_agent_of_episode(chunks: Iterable[SingleAgentEpisode]) -> dict[tuple[int, int], list[SingleAgentEpisode]]:
     """(seed, agent) → its chunks, in order."""
-    found = defaultdict(list)
-    for chunk in chunks:
+    episodes = defaultdict(list)
+    for chunk in sorted(chunks, key=lambda chunk: chunk.t_started):
         agent, seed, _ = chunk.observations.data["observation"][0].astype(int)
-        assert chunk.agent_id == f"agent_{agent}"
-        assert chunk.module_id == f"policy_{agent % 2}"
-        found[seed, agent].append(chunk)
-    for own in found.values():
-        own.sort(key=lambda chunk: chunk.t_started)
-    return found
+        assert (chunk.agent_id, chunk.module_id) == (f"agent_{agent}", f"policy_{agent % 2}")
+        episodes[seed, agent].append(chunk)
+    return episodes
 
 
 def check_agent(
@@ -107,8 +103,8 @@ def check_outputs(chunk: SingleAgentEpisode, steps_before: int) -> None:
     logits = forward({"policy_1": ForwardInput(observations, None)})["policy_1"].dist_inputs
     np.testing.assert_allclose(extra[Columns.ACTION_DIST_INPUTS].data, logits, rtol=1e-6, atol=1e-6)
     p = np.exp(logits - np.logaddexp.reduce(logits, axis=1, keepdims=True))
-    chosen = p[np.arange(len(chunk)), chunk.actions.data]
-    np.testing.assert_allclose(np.exp(extra[Columns.ACTION_LOGP].data), chosen, rtol=1e-5)
+    probabilities = p[np.arange(len(chunk)), chunk.actions.data]
+    np.testing.assert_allclose(np.exp(extra[Columns.ACTION_LOGP].data), probabilities, rtol=1e-5)
     if chunk.module_id == "policy_0":
         states = extra[Columns.STATE_IN].data["steps"]
         assert states.tolist() == [[step] for step in range(steps_before, steps_before + len(chunk))]
@@ -124,7 +120,7 @@ def check_outputs(chunk: SingleAgentEpisode, steps_before: int) -> None:
     opponents=st.sampled_from([[], [RANDOM]]),
     fragment_lengths=FRAGMENT_LENGTHS,
 )
-@examples(150)
+@examples(100)
 def test_each_step_of_a_policy_is_recorded_once(
     agents: int,
     num_envs: int,
@@ -139,22 +135,22 @@ def test_each_step_of_a_policy_is_recorded_once(
     env = Scripted(agents, num_envs, crashing)
     play = self_play(env, opening_plies=plies, opponents=opponents)
     chunks = sample(play, fragment_lengths)
-    found = by_agent_of_episode(chunks)
+    recorded = by_agent_of_episode(chunks)
     ids = [chunk.id_ for chunk in chunks]
     assert len(set(ids)) == len(ids)
-    for (seed, agent), own in found.items():
+    for (seed, agent), parts in recorded.items():
         played = env.played[seed]
-        check_agent(own, played.agents[agent], played, seed, agent)
+        check_agent(parts, played.agents[agent], played, seed, agent)
     for seed, played in env.played.items():
-        for agent, seen in played.agents.items():
-            rows = [group for group in seen.groups if seen.is_own(group)]
-            closed = len(rows) - (seen.ending is None)
+        for agent, record in played.agents.items():
+            rows = [group for group in record.groups if record.is_own(group)]
+            closed = len(rows) - (record.ending is None)
             if not played.is_lost and closed > 0:
-                assert sum(map(len, found[seed, agent])) == closed
+                assert sum(map(len, recorded[seed, agent])) == closed
 
 
 @given(fragment_lengths=FRAGMENT_LENGTHS)
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_a_crashed_episode_is_not_continued(fragment_lengths: list[int]) -> None:
     """Chunks from before the crash are complete; open steps are dropped."""
     env = Scripted(3, 2, crashing=0.2)
@@ -176,14 +172,14 @@ def test_an_opponent_plays_all_sides_but_one() -> None:
         learning[seed].add(agent)
     opposed = []
     for seed, played in env.played.items():
-        by = {agent: set(seen.groups) for agent, seen in played.agents.items() if seen.groups}
+        by = {agent: set(record.groups) for agent, record in played.agents.items() if record.groups}
         assert all(len(groups) == 1 for groups in by.values())
-        others = {
+        opponents = {
             agent for agent, groups in by.items() if isinstance(play._controllers[next(iter(groups))], OpponentPolicy)
         }
-        assert not others & learning[seed]
-        assert others in (set(), others & {0, 2}, others & {1, 3})
-        opposed.append((bool(others & {0, 2}), bool(others & {1, 3})))
+        assert not opponents & learning[seed]
+        assert opponents in (set(), opponents & {0, 2}, opponents & {1, 3})
+        opposed.append((bool(opponents & {0, 2}), bool(opponents & {1, 3})))
     share = np.mean([any(pair) for pair in opposed])
     assert 0.6 < share < 0.9
     assert abs(np.mean(opposed, axis=0) - share / 2).max() < 0.1
@@ -209,29 +205,6 @@ def test_a_version_as_opponent_needs_a_storage() -> None:
         self_play(Scripted(2, 1), opponents=[OpponentConfig(ref="somewhere@3", share=1)])
 
 
-def test_a_restart_is_reproducible() -> None:
-    """For any earlier episodes, in a new environment."""
-
-    def chunks_after(steps_before: int) -> list[tuple[object, ...]]:
-        env = Scripted(3, 2)
-        play = self_play(env, opening_plies=2, opponents=[RANDOM])
-        sample(play, [steps_before])
-        begin(play, env, steps=5000)
-        return [
-            (
-                chunk.id_,
-                chunk.agent_id,
-                chunk.t_started,
-                chunk.observations.data["observation"].tolist(),
-                chunk.actions.data.tolist(),
-                chunk.rewards.data.tolist(),
-            )
-            for chunk in sample(play, [7, 20])
-        ]
-
-    assert chunks_after(11) == chunks_after(30)
-
-
 def test_games_do_not_wait_for_a_partner_beyond_a_restart() -> None:
     def results_after(steps_before: int) -> tuple[list[float], ...]:
         env = Scripted(2, 2)
@@ -254,15 +227,15 @@ def test_metrics_exclude_opponents_and_crashed_episodes() -> None:
     sample(play, [300])
     finished = [episode for episode in env.played.values() if episode.is_over]
     assert play.metrics.episodes == len(finished)
-    rows = [group for episode in env.played.values() for seen in episode.agents.values() for group in seen.groups]
+    rows = [group for episode in env.played.values() for record in episode.agents.values() for group in record.groups]
     waiting = sum(len(batch) for batch in play._turn.batches.values())
     assert play.metrics.steps == len(rows) - waiting
     expected = []
     for episode in finished:
         steps, returns = [0] * 3, [0.0] * 3
-        for agent, seen in episode.agents.items():
-            if seen.ending and seen.groups and seen.is_own(seen.groups[0]):
-                steps[agent], returns[agent] = len(seen.groups), sum(seen.rewards) + seen.ending.reward
+        for agent, record in episode.agents.items():
+            if record.ending and record.groups and record.is_own(record.groups[0]):
+                steps[agent], returns[agent] = len(record.groups), sum(record.rewards) + record.ending.reward
         if any(steps):
             expected.append((episode.steps, steps, returns))
     logged = [
@@ -273,12 +246,48 @@ def test_metrics_exclude_opponents_and_crashed_episodes() -> None:
     assert sorted(logged) == sorted(expected)
 
 
-def test_random_play_is_uniform_over_legal_actions() -> None:
-    env = Scripted(2, 3)
-    play = self_play(env)
-    for _ in range(60):
-        play.step(None, explore=False)
-    for chunk in cut(play):
-        np.testing.assert_allclose(np.exp(chunk.extra_model_outputs[Columns.ACTION_LOGP].data), 0.5, rtol=1e-6)
-        legal = to_environment(chunk.actions.data, interface(2).of_policy("policy_0").action)
-        assert set(legal.tolist()) <= {1, 2, 3}
+sizes = st.integers(1, 5)
+
+
+def seeds_of_attempt(seed: int, runners: int, num_envs: int, episodes: int, steps: int = 0) -> list[int]:
+    """The seeds of one attempt in which each environment starts `episodes` episodes."""
+    return [
+        ResetSeeds.of_run(seed, runner=runner, runners=runners, num_envs=num_envs, steps=steps)(env, episode)
+        for runner in range(runners)
+        for env in range(num_envs)
+        for episode in range(episodes)
+    ]
+
+
+@given(st.integers(0, 2**40), sizes, sizes, st.integers(1, 20))
+def test_no_two_resets_share_a_seed(seed: int, runners: int, num_envs: int, episodes: int) -> None:
+    seeds = seeds_of_attempt(seed, runners, num_envs, episodes)
+    assert len(set(seeds)) == len(seeds)
+    assert all(0 <= number < SEEDS for number in seeds)
+
+
+@given(sizes, sizes, st.integers(0, 1000), st.lists(st.lists(sizes, min_size=1, max_size=8), min_size=2, max_size=5))
+def test_a_restart_uses_no_seed_of_earlier_attempts(
+    runners: int, num_envs: int, steps: int, attempts: list[list[int]]
+) -> None:
+    """An attempt is a list of samples: the minimum number of actions in each environment. Each environment of each
+    runner may have used the maximum number of seeds: one at the start, and one after each step, in the sample that ends
+    a step late.
+    """
+    used_seeds: set[int] = set()
+    for samples in attempts:
+        turns = sum(share + 1 for share in samples)
+        new = seeds_of_attempt(3, runners, num_envs, turns + 1, steps)
+        assert not used_seeds & set(new)
+        used_seeds |= set(new)
+        # All runners together count at least the share of each.
+        steps += sum(share * num_envs * runners for share in samples)
+
+
+def test_a_restart_at_the_same_step_has_the_same_seeds() -> None:
+    assert seeds_of_attempt(1, 2, 3, 4, steps=77) == seeds_of_attempt(1, 2, 3, 4, steps=77)
+
+
+def test_runs_with_other_seeds_have_other_seeds() -> None:
+    first, second = (ResetSeeds.of_run(seed, runner=0, runners=1, num_envs=1, steps=0)(0, 0) for seed in (0, 1))
+    assert abs(first - second) > 1000

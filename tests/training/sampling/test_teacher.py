@@ -10,6 +10,7 @@ from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.errors import ConfigError, GameCrashed, LeagueError
 from league.spaces import ACTION_MASK
+from tests.support.algorithms import running
 from tests.support.leagues import tictactoe
 from tests.support.leagues.training_leagues import counting, solvable
 from tests.support.learners import episodes_of
@@ -106,16 +107,8 @@ def test_errors_of_the_teacher_end_training(
 ) -> None:
     """The last one with the first sample, the others before it."""
     league = with_teacher(ref, runners=runners)
-    with pytest.raises(Exception) as raised:  # noqa: PT011
-        train(league)
+    with pytest.raises(Exception) as raised, running(league) as algorithm:  # noqa: PT011
+        algorithm.train()
     cause = training_error(raised.value, league.league, tmp_path)
     assert isinstance(cause, error)
     assert str(cause).startswith(message.format(ref))
-
-
-def train(league: LeagueConfig) -> None:
-    algorithm = algorithm_config(league, interface(league)).build_algo()
-    try:
-        algorithm.train()
-    finally:
-        algorithm.stop()

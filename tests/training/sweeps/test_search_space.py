@@ -4,7 +4,7 @@ import sys
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from league.config.sweep import SweepConfig
@@ -37,6 +37,7 @@ def test_the_seed_determines_the_draws() -> None:
 
 
 @given(st.integers(0, 1000), st.floats(1e-6, 1.0), st.floats(1.001, 100.0))
+@settings(max_examples=40)
 def test_draws_are_within_their_range(seed: int, low: float, factor: float) -> None:
     bounds = [low, low * factor]
     parameters = {
@@ -60,9 +61,8 @@ def test_draws_are_within_their_range(seed: int, low: float, factor: float) -> N
         assert trial["value"] == {"nested": [1, 2]}
 
 
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
+def test_invalid_parameters_are_rejected(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[Any, str]] = [
         ([], "at least one value"),
         ({"lognormal": [1, 2]}, "one of choice, uniform"),
         ({"uniform": [1, 2], "choice": [1]}, "one of choice, uniform"),
@@ -76,11 +76,11 @@ def test_draws_are_within_their_range(seed: int, low: float, factor: float) -> N
         ({"quniform": [0, 1]}, r"\[low, high, step\]"),
         ({"quniform": [0, 1, 0]}, r"\[low, high, step\]"),
         ({"quniform": [0, 1, 0.3]}, r"\[low, high, step\] .* not divisible"),
-    ],
-)
-def test_invalid_parameters_are_rejected(values: Any, expected: str) -> None:
-    with pytest.raises(ConfigError, match=rf"sweep\.parameters\.lr: expected .*{expected}"):
-        plan(tictactoe(), sweep({"lr": values}))
+    ]
+    for values, expected in rows:
+        message = rf"sweep\.parameters\.lr: expected .*{expected}"
+        with subtests.test(values), pytest.raises(ConfigError, match=message):
+            plan(tictactoe(), sweep({"lr": values}))
 
 
 SPACE = {

@@ -156,10 +156,10 @@ def test_a_killed_sweep_continues_with_its_unfinished_trials(registry: Registry)
     shorter = league({"steps": [256]}, training={"epochs": 32, "minibatch_size": 32}, metric="shared/length")
     with pytest.raises(ConfigError, match="sweep has changed"):
         sweep(shorter, registry=registry, resume=True)
-    shown = io.StringIO()
-    report = sweep(LONG, registry=registry, resume=True, publish_best=False, console=Console(file=shown))
+    output = io.StringIO()
+    report = sweep(LONG, registry=registry, resume=True, publish_best=False, console=Console(file=output))
     assert outcome.stat().st_mtime_ns == before, "a finished trial is not repeated"
-    assert "trial 0" not in shown.getvalue()
+    assert "trial 0" not in output.getvalue()
     assert [trial.outcome.steps for trial in report.trials if trial.outcome] == [256, 1024]
     assert report.version is None
     first_of_second_life = EventAccumulator(str(max((report.path / "trial-001").glob("events*"))))
@@ -193,13 +193,13 @@ def test_a_killed_search_by_optuna_continues_as_the_same_search(registry: Regist
     (file,) = home.rglob("sweep.json")
     before = json.loads(file.read_text())["trials"]
     assert len(before) < 4, "a trial is recorded when it starts"
-    shown = io.StringIO()
-    report = sweep(SEARCH, registry=registry, resume=True, console=Console(file=shown, width=500))
+    output = io.StringIO()
+    report = sweep(SEARCH, registry=registry, resume=True, console=Console(file=output, width=500))
     assert report.is_whole
     assert [trial.outcome.steps for trial in report.trials if trial.outcome] == [768] * 4
     trials = [trial.settings for trial in report.trials]
     assert trials[: len(before)] == before
-    assert "Not tried: sweep.parameters: lr" in shown.getvalue()
+    assert "Not tried: sweep.parameters: lr" in output.getvalue()
     assert {settings["minibatch_size"] for settings in trials} == {32}
     with closing(Registry.open(Storage.at(tmp_path / "whole"))) as whole:
         uninterrupted = sweep(SEARCH, registry=whole, console=Console(quiet=True))

@@ -1,15 +1,31 @@
+"""What a sweep keeps, and the strength of its trials: the mean of their scores, and its interval."""
+
+import json
+import math
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
+from evaluation.matches.worker import MatchWorker
+from evaluation.service.strength_process import StrengthProcess
+from evaluation.service.strength_worker import measured
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
+from league.environments.building import interface
 from league.errors import AlreadyRunning, ConfigError, NotFound
+from league.registry.registry import Registry
+from league.registry.training.strength import StrengthScore
 from league.settings import Storage
+from tests.support.algorithms import running
 from tests.support.leagues.training_leagues import tictactoe
 from training.algorithms.resources import Resources
+from training.export import parity
 from training.sweeps.search_space import Settings, TrialOutcome
+from training.sweeps.strength import HIGH, LOW, STRENGTH, mean_strength, trial_strength
 from training.sweeps.sweep_directory import SweepDirectory
 
 TRIALS: list[Settings] = [{"lr": 0.1}, {"lr": 0.2}]
@@ -46,11 +62,12 @@ def test_the_references_of_trials_are_pinned(storage: Storage) -> None:
     trials += [{"teacher": {"ref": "@champion", "weight": 0.5}}]
     pins = {"@champion": "tictactoe@1", "script:random": "script:random"}
     sweep = SweepDirectory.begin(storage, league(), pins, trials, None)
-    found = [sweep.league(number).training for number in range(3)]
-    assert [each.ref for settings in found for each in settings.opponents.fixed] == ["tictactoe@1", "script:random"]
-    assert isinstance(found[2], PPOConfig)
-    assert found[2].teacher is not None
-    assert found[2].teacher.ref == "tictactoe@1"
+    settings = [sweep.league(number).training for number in range(3)]
+    taught, opponents = settings[2], [opponent.ref for part in settings for opponent in part.opponents.fixed]
+    assert opponents == ["tictactoe@1", "script:random"]
+    assert isinstance(taught, PPOConfig)
+    assert taught.teacher is not None
+    assert taught.teacher.ref == "tictactoe@1"
 
 
 def test_late_trials_are_recorded_with_their_resources_and_pins(storage: Storage) -> None:
@@ -103,3 +120,48 @@ def test_a_sweep_has_one_driver(storage: Storage, sweep: SweepDirectory) -> None
         pass
     with sweep.locked():
         pass
+
+
+def test_a_single_score_keeps_its_interval() -> None:
+    assert mean_strength([StrengthScore("script:random", 200, 0.8, 0.7, 0.875)]) == pytest.approx((0.8, 0.7, 0.875))
+
+
+def test_the_interval_of_a_mean_is_narrower_than_those_of_its_scores() -> None:
+    """Of n equal scores it is narrower by √n."""
+    scores = [StrengthScore(f"tictactoe@{number}", 200, 0.6, 0.5, 0.7) for number in range(4)]
+    assert mean_strength(scores) == pytest.approx((0.6, 0.55, 0.65))
+
+
+def test_the_distances_to_the_bounds_add_up_in_quadrature() -> None:
+    scores = [StrengthScore("a", 100, 0.5, 0.2, 0.9), StrengthScore("b", 100, 1.0, 0.6, 1.0)]
+    mean, low, high = mean_strength(scores)
+    assert mean == 0.75
+    assert low == pytest.approx(0.75 - math.hypot(0.3, 0.4) / 2)
+    assert high == pytest.approx(0.75 + 0.4 / 2)
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_a_checkpoint_plays_and_training_continues_as_without_games(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process: that another one plays is tested with the evaluation service."""
+    monkeypatch.setattr(parity, "EXPORTED", replace(parity.EXPORTED, observations=256))
+    config = tictactoe(train_batch_size=64, minibatch_size=32, epochs=1, strength={"games": 20})
+    opponents = ["script:random", "script:one_ply"]
+    with running(config) as algorithm:
+        algorithm.train()
+        algorithm.save_to_path(str(tmp_path / "64"))
+    with closing(Registry.open(Storage.at(tmp_path / "home"))) as registry:
+        registry.leagues.register(config, interface(config))
+        state = torch.get_rng_state()
+        with closing(StrengthProcess(registry.storage)) as games:
+            worker = MatchWorker(config, registry)
+            monkeypatch.setattr(
+                games._process, "request", lambda text: (measured(registry, worker, json.loads(text)), b"")
+            )
+            metrics = trial_strength(tmp_path / "64", config, interface(config), opponents, games)
+        assert torch.equal(state, torch.get_rng_state())
+        assert registry.versions.all("tictactoe") == []
+    scores = [metrics[f"{STRENGTH}/{opponent}"] for opponent in opponents]
+    assert metrics[STRENGTH] == pytest.approx(sum(scores) / 2)
+    assert 0 <= metrics[LOW] < metrics[STRENGTH] < metrics[HIGH] <= 1
