@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from benchmarks.harness import Target
 from tests.support.generated_requests import OPERATIONS, draw_request
 from tests.support.servers import postgresql
-from tests.support.servers.two_databases import is_available, replicas_of_both
+from tests.support.servers.two_databases import is_available, outline, replicas_of_both
 
 EXAMPLES = 25
 """Of an operation at a time."""
@@ -39,7 +39,8 @@ def databases(requests: int) -> Iterator[Target]:
 
         def send(data: Any, operation: Any) -> None:
             drawn = draw_request(data, operation)
-            one, other = replicas.outline(drawn.method, drawn.url, drawn.content, drawn.headers)
+            responses = replicas.responses(drawn.method, drawn.url, drawn.content, drawn.headers)
+            one, other = map(outline, responses)
             statuses[one[0]] += 1
             call = f"{drawn.method} {drawn.url[:200]} {(drawn.content or b'')[:200]!r}"
             if one != other:

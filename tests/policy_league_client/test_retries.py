@@ -43,6 +43,7 @@ class Server:
 
         class Handler(BaseHTTPRequestHandler):
             protocol_version = "HTTP/1.1"
+            wbufsize = -1  # head and body in one packet: the second of two waits 40 ms
 
             def do_POST(self) -> None:
                 server.connections.add(self.client_address)
@@ -88,14 +89,14 @@ def short_delays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_promotion_is_retried_with_the_same_idempotency_key(connect: Connect, server: Server) -> None:
     server.prepare(DROP, 503, NO_RESPONSE, then=MOVED)
-    client = connect(server.url, key="plk_x", timeout=0.3)
+    client = connect(server.url, key="plk_x", timeout=0.1)
     assert client.promote("board@2", expected=1, reason="better").event == 3
     bodies, headers = zip(*server.requests, strict=True)
     assert len(bodies) >= 4, "a busy machine may be late for the last attempt, too"
     assert set(bodies) == {b'{"version":2,"expected":1,"reason":"better"}'}
     assert len({sent["idempotency-key"] for sent in headers}) == 1
     assert {sent["authorization"] for sent in headers} == {"Bearer plk_x"}
-    assert {sent["x-request-timeout-ms"] for sent in headers} == {"300"}
+    assert {sent["x-request-timeout-ms"] for sent in headers} == {"100"}
     client.promote("board@2", idempotency_key="mine")
     assert server.requests[-1][1]["idempotency-key"] == "mine"
     client.rollback("board")
@@ -110,31 +111,9 @@ def test_a_retry_repeats_the_seed(connect: Connect, server: Server) -> None:
     assert [json.loads(body)["seed"] for body in bodies] == [answer.seed]
 
 
-def test_a_retry_deadline_of_zero_disables_retries(connect: Connect, server: Server) -> None:
-    failures = (
-        (429, errors.Overloaded),
-        (503, errors.NotReady),
-        (504, errors.DeadlineExceeded),
-        (DROP, errors.RemoteError),
-    )
-    for number, (status, expected) in enumerate(failures, 1):
-        server.prepare(status, then=ACTED)
-        with pytest.raises(expected):
-            connect(server.url, retry_deadline=0).act("board", [1])
-        assert len(server.requests) == number
-
-
-def test_retry_after_beyond_the_deadline_ends_the_retries(connect: Connect, server: Server) -> None:
-    server.prepare(429, then=ACTED, retry_after="60")
-    server.answers[0][1].update(code="rate_limited")
-    with pytest.raises(errors.RateLimited) as raised:
-        connect(server.url, retry_deadline=30).act("board", [1])
-    assert (raised.value.wait, len(server.requests)) == (60, 1)
-
-
 def test_the_timeout_applies_to_each_attempt(connect: Connect, server: Server) -> None:
     server.prepare(NO_RESPONSE, NO_RESPONSE, then=ACTED)
-    assert connect(server.url, timeout=0.2).act("board", [1]).action == 4  # on a busy machine, others time out, too
+    assert connect(server.url, timeout=0.1).act("board", [1]).action == 4  # on a busy machine, others time out, too
     assert len({body for body, _ in server.requests}) == 1
 
 

@@ -16,6 +16,7 @@ from league import errors
 from league.registry.registry import Registry
 from policy_league_client import AsyncClient
 from serve_app.runtime.haproxy import free_ports
+from serve_app.runtime.uvicorn_websocket import StreamWebSocketProtocol
 from tests.support.clients.actions import BOARD, boards
 from tests.support.clients.sync_and_async import SETTINGS, Connect
 from tests.support.leagues.served_leagues import promote
@@ -80,36 +81,46 @@ def test_what_cannot_start_raises(connect: Connect, url: str) -> None:
         stream.act(np.zeros(SETTINGS.max_body, np.int8))
 
 
-def abort_connections(listener: Listening) -> None:
-    """End all connections without a closing handshake, as when the process dies."""
+def abort_streams(listener: Listening) -> None:
+    """End all streams without a closing handshake, as when the process dies."""
     for connection in list(listener.uvicorn.server_state.connections):
-        connection.loop.call_soon_threadsafe(connection.transport.abort)
+        if isinstance(connection, StreamWebSocketProtocol):
+            connection.loop.call_soon_threadsafe(connection.transport.abort)
 
 
 @pytest.mark.parametrize("is_warned", [True, False], ids=["drained", "died"])
-@pytest.mark.parametrize("follow", [True, False], ids=["following", "pinned"])
-def test_a_stream_continues_on_another_replica(
-    connect: Connect, registry: Registry, is_warned: bool, follow: bool
+def test_streams_and_episodes_continue_on_another_replica_unless_their_version_is_gone(
+    connect: Connect, registry: Registry, is_warned: bool
 ) -> None:
     (port,) = free_ports(1, "127.0.0.1")
     with listening(registry.storage, port=port) as first:
         client = connect(first.url)
-        one, two, board = (client.stream(model, follow=follow) for model in ("memory", "memory", "board"))
-        assert (board.version, board.last) == (None, None)
+        one, two = client.stream("memory"), client.stream("memory", follow=True)
+        pinned, following = client.stream("board"), client.stream("board", follow=True)
+        episode, lost = client.episode("memory"), (client.episode("board@3"), client.stream("board@3"))
+        assert (pinned.version, pinned.last) == (None, None)
         assert [one.act(ONE) for _ in range(2)] == [0, 0]
         assert two.act_batch([ONE, 2 * ONE]) == [0, 0]
-        board.act(BOARD)
+        assert [episode.act(ONE) for _ in range(2)] == [0, 0]
+        for acting in (pinned, following, *lost):
+            acting.act(BOARD)
         promote(registry, "board", 2)
         if not is_warned:
-            abort_connections(first)
+            abort_streams(first)
             assert one.act(ONE) == 1, "a reconnection to the same replica works too"
+    shutil.rmtree(registry.artifacts.path("board", 3))
     with listening(registry.storage, replica="replica-2", port=port):
-        assert one.act(ONE) == 1
+        assert one.act(ONE) == episode.act(ONE) == 1
         assert two.act_batch([ONE, ONE], reset=[True, False]) == [0, 1]
-        board.act(BOARD)
-        assert board.version == (2 if follow else 1)
-        assert {stream.last.replica for stream in (one, two, board)} == {"replica-2"}
-        for stream in (one, two, board):
+        for stream, version in ((pinned, 1), (following, 2)):
+            stream.act(BOARD)
+            assert stream.version == version
+        for acting in (one, two, pinned, following, episode):
+            assert acting.last.replica == "replica-2"
+        for acting, reason in zip(lost, ("cannot continue after 1 actions of board@3", "board@3"), strict=True):
+            with pytest.raises(errors.VersionRetired, match=reason):
+                acting.act(BOARD)
+        for stream in (one, two, pinned, following):
             stream.close()
 
 
@@ -252,22 +263,3 @@ def test_an_exploring_episode_is_reproducible(connect: Connect, url: str) -> Non
         assert episode.last.probabilities[action] > 0
         alone = connect(url).act("board@1", BOARD, explore=True, seed=episode.last.seed)
         assert alone.action == action
-
-
-def test_an_episode_survives_its_replica_but_not_its_version(connect: Connect, registry: Registry) -> None:
-    (port,) = free_ports(1, "127.0.0.1")
-    with listening(registry.storage, port=port) as first:
-        client = connect(first.url)
-        episode, other, stream = client.episode("memory"), client.episode("board@3"), client.stream("board@3")
-        assert [episode.act(ONE) for _ in range(2)] == [0, 0]
-        for acting in (other, stream):
-            acting.act(BOARD)
-    shutil.rmtree(registry.artifacts.path("board", 3))
-    with listening(registry.storage, replica="replica-2", port=port):
-        assert episode.act(ONE) == 1
-        assert episode.last is not None
-        assert episode.last.replica == "replica-2"
-        with pytest.raises(errors.VersionRetired, match=r"cannot continue after 1 actions of board@3"):
-            other.act(BOARD)
-        with pytest.raises(errors.VersionRetired):
-            stream.act(BOARD)

@@ -53,6 +53,23 @@ def read_only_client(storage: Storage) -> Iterator[TestClient]:
 
 
 @pytest.fixture(scope="session")
+def leagues(tmp_path_factory: pytest.TempPathFactory) -> Storage:
+    """Leagues with each type of tensors, for tests that do not change them."""
+    storage = Storage.at(tmp_path_factory.mktemp("kinds"))
+    every_kind(storage).close()
+    return storage
+
+
+@pytest.fixture
+def promoter(registry: Registry) -> Iterator[TestClient]:
+    """A replica, called with a key that may promote."""
+    _, token = registry.keys.create("release-bot", ["promote", "read", "act"])
+    with replica(registry.storage) as client:
+        client.headers["authorization"] = f"Bearer {token}"
+        yield client
+
+
+@pytest.fixture(scope="session")
 def ray_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RayServer]:
     """Ray Serve, HAProxy and two replicas. One server for all tests that need a real one; keys are not required."""
     registry = every_kind(Storage.at(tmp_path_factory.mktemp("served")))

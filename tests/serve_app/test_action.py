@@ -426,9 +426,9 @@ def test_a_shadow_samples_with_the_random_numbers_of_the_champion(
     observations = boards(40)
     for start in range(0, 40, 8):
         act(sampled, observations=observations[start : start + 8], **({"explore": False} if start == 8 else {}))
-    found = wait_for(registry, lambda one: one.requests == 5, candidate=candidate)
-    assert found.observations == 40
-    assert (found.agreed == 40) == is_equal
+    counts = wait_for(registry, lambda one: one.requests == 5, candidate=candidate)
+    assert counts.observations == 40
+    assert (counts.agreed == 40) == is_equal
 
 
 def test_loaded_versions_follow_the_league(registry: Registry) -> None:
@@ -441,8 +441,8 @@ def test_loaded_versions_follow_the_league(registry: Registry) -> None:
         assert len(set(actions(client, version=2))) > 1
         set_shadow(registry, 4)
         act(client, observations=boards(8))
-        found = wait_for(registry, lambda one: one.requests == 1, candidate=4)
-        assert (found.observations, found.agreed) == (8, 8)
+        counts = wait_for(registry, lambda one: one.requests == 1, candidate=4)
+        assert (counts.observations, counts.agreed) == (8, 8)
         register(registry, "board", {"shared": SPACES}, actions="greedy")
         until(lambda: len(set(actions(client))) == 1)
 

@@ -377,23 +377,18 @@ def test_unknown_games_are_reported(games: TestClient, match: Match, subtests: p
             assert (reply.status_code, reply.json()["code"]) == (status, code)
 
 
-def test_a_league_without_matches_can_be_played_with_scripts(games: TestClient) -> None:
-    body = {"opponent": "script:one_ply", "agent": "player_2"}
-    state = games.post("/v1/leagues/other/play", json=body).json()
-    assert [move["agent"] for step in state["steps"] for move in step["moves"]] == ["player_1"]
-
-
 def test_errors_of_the_evaluation_service_keep_their_status(playable: Registry) -> None:
-    for error, status in (
-        (NoEvaluationService("it is away"), 503),
-        (Overloaded("too many"), 429),
-        (GameHung("it hangs"), 504),
-        (RemoteError("it is unreachable"), 502),
-    ):
-        service = Mock(request_game=AsyncMock(side_effect=error))
-        with local_client(
-            Replica(Registry.open(playable.storage), QUICK, "replica-1", evaluation_client=service)
-        ) as client:
+    service = Mock(request_game=AsyncMock())
+    with local_client(
+        Replica(Registry.open(playable.storage), QUICK, "replica-1", evaluation_client=service)
+    ) as client:
+        for error, status in (
+            (NoEvaluationService("it is away"), 503),
+            (Overloaded("too many"), 429),
+            (GameHung("it hangs"), 504),
+            (RemoteError("it is unreachable"), 502),
+        ):
+            service.request_game.side_effect = error
             reply = client.get(f"{LEAGUE}/playable")
             assert (reply.status_code, reply.json()) == (status, {"code": error.code, "message": str(error)})
             assert ("retry-after" in reply.headers) == (status in (429, 503))

@@ -22,7 +22,6 @@ from tests.support.leagues import reported_league, tictactoe
 from tests.support.leagues.match_results import EARLIER, LOST, PENDING, RANKED, SCHEDULE, WON, record
 from tests.support.leagues.served_leagues import everything, promote
 from tests.support.servers.replicas import QUICK, replica
-from tests.support.waiting import until
 
 BOARD = "/v1/leagues/board"
 OPENAPI = document(QUICK, [])
@@ -187,9 +186,9 @@ def test_matches_of_another_game_are_listed_but_not_counted(recorded: Storage, r
 
 def test_matches_of_a_pair_are_listed_in_either_order(reader: TestClient) -> None:
     queries = [{"first": "board@1", "second": "board@2"}, {"first": "board@2", "second": "board@1"}]
-    found = [pages(reader, f"{BOARD}/matches", "Matches", "matches", limit=2, **way) for way in queries]
-    assert found[0] == found[1]
-    assert [match["contestants"] for page in found[0] for match in page] == [["board@1", "board@2"]] * 3
+    both = [pages(reader, f"{BOARD}/matches", "Matches", "matches", limit=2, **way) for way in queries]
+    assert both[0] == both[1]
+    assert [match["contestants"] for page in both[0] for match in page] == [["board@1", "board@2"]] * 3
     assert get(reader, f"{BOARD}/matches", "Matches", first="board@1", second="nobody")["matches"] == []
 
 
@@ -378,8 +377,8 @@ def test_all_pages_are_the_same_document_whose_references_hold_below_any_prefix(
         for prefix in ("", "/ai", "/very/long"):
             with subtests.test(path, prefix=prefix):
                 url = f"http://host{prefix}"
-                shown = re.sub(reference + r'[^"]+', lambda match, at=url + path: urljoin(at, match[0]), reply.text)
-                assert shown == re.sub(reference + "/", f"{url}/", document)
+                page = re.sub(reference + r'[^"]+', lambda match, at=url + path: urljoin(at, match[0]), reply.text)
+                assert page == re.sub(reference + "/", f"{url}/", document)
     assert read_only_client.get("/leagues" + "/a" * 20).status_code == 404, "too many slashes"
 
 
@@ -423,14 +422,6 @@ def test_an_unmodified_file_is_not_sent_again(read_only_client: TestClient) -> N
     second = read_only_client.get("/pages/app.js", headers={"if-none-match": f'W/"other", {first.headers["etag"]}'})
     assert (second.status_code, second.content) == (304, b"")
     assert read_only_client.get("/pages/app.js", headers={"if-none-match": 'W/"other"'}).status_code == 200
-
-
-def test_pages_need_no_key(client: TestClient, registry: Registry) -> None:
-    registry.keys.create("bot", ["read"])
-    until(lambda: client.get("/v1/leagues").status_code == 401)
-    for path in ("/", "/leagues/board", "/pages/app.js"):
-        assert client.get(path).status_code == 200
-    assert client.post("/leagues/board").status_code == 401
 
 
 def test_the_document_refers_to_existing_files_and_has_no_inline_code() -> None:

@@ -115,10 +115,10 @@ def test_the_leaderboard_shows_searches(registry: Registry, served: tuple[TestCl
     document = {"sides": [], "leaderboard": rows, "by_side": {}, "not_champion": None}
     registry.snapshots.put(LEAGUE, {"leaderboard": document}, registry.snapshots.current_marks()[LEAGUE])
     client, _ = served
-    searching, *others = client.get(f"/v1/leagues/{LEAGUE}/leaderboard").json()["leaderboard"]
+    searching, *scripts = client.get(f"/v1/leagues/{LEAGUE}/leaderboard").json()["leaderboard"]
     search = searching["search"]
     assert (search["version"], search["rule"], search["simulations"], search["ms"] > 0) == (1, "puct", 50, True)
-    assert [row["search"] for row in others] == [None, None]
+    assert [row["search"] for row in scripts] == [None, None]
 
 
 def test_a_search_version_is_a_canary_a_shadow_and_a_champion(

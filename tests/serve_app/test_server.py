@@ -123,20 +123,20 @@ def test_actions_bypass_ray_serve_and_its_protocols(url: str) -> None:
 def test_all_processes_of_a_local_server_listen_on_loopback(served: Registry) -> None:
     # Of Ray, its agents, replicas and HAProxy, which may be starting again.
     until(lambda: len({name for name, _ in listeners(served.storage)}) > 5)
-    found = listeners(served.storage)
-    addresses = {ip_address(address.removeprefix("::ffff:")) for _, address in found}
-    assert [address for address in addresses if not address.is_loopback] == [], found
+    sockets = listeners(served.storage)
+    addresses = {ip_address(address.removeprefix("::ffff:")) for _, address in sockets}
+    assert [address for address in addresses if not address.is_loopback] == [], sockets
 
 
 def listeners(storage: Storage) -> set[tuple[str, str]]:
     """Process and address of each socket of a server that listens."""
-    found = set()
+    addresses = set()
     for pid in processes(storage, ""):
         with suppress(psutil.NoSuchProcess):
             process = psutil.Process(pid)
             sockets = process.net_connections("tcp")
-            found |= {(process.name(), one.laddr.ip) for one in sockets if one.status == psutil.CONN_LISTEN}
-    return found
+            addresses |= {(process.name(), one.laddr.ip) for one in sockets if one.status == psutil.CONN_LISTEN}
+    return addresses
 
 
 def test_messages_to_ray_serve_itself_are_not_read(served: Registry) -> None:
@@ -253,12 +253,12 @@ def test_a_body_of_a_hundred_megabytes_is_rejected(url: str, served: Registry) -
 
 def peaks(storage: Storage) -> dict[int, int]:
     """Process id of each replica → its peak resident size in bytes."""
-    found = {}
+    sizes = {}
     for pid in processes(storage, "PolicyServer"):
         with suppress(FileNotFoundError):
             (peak,) = re.findall(r"^VmHWM:\s+(\d+) kB$", Path(f"/proc/{pid}/status").read_text(), re.M)
-            found[pid] = int(peak) * 1024
-    return found
+            sizes[pid] = int(peak) * 1024
+    return sizes
 
 
 @pytest.mark.e2e
@@ -321,8 +321,8 @@ def test_episodes_survive_a_draining_replica(ray_server: RayServer, served: Regi
         assert codes
         assert set(codes) == {1012}
         assert [stream.act([1.0]) for stream in streams] == [1] * 6
-        until(lambda: any(each.is_over for each in listeners))
-        assert not all(each.is_over for each in listeners)
+        until(lambda: any(listener.is_over for listener in listeners))
+        assert not all(listener.is_over for listener in listeners)
         scale(ray_server, 2)
     until(lambda: serving(served, 1) >= 2)
 
@@ -409,7 +409,7 @@ def test_a_killed_evaluation_continues_and_equals_league_evaluate(
 
 
 def is_stored(registry: Registry, schedule: str) -> bool:
-    return schedule in [each.id for each in Ledger(registry).schedules(tictactoe.LEAGUE)]
+    return schedule in [row.id for row in Ledger(registry).schedules(tictactoe.LEAGUE)]
 
 
 def test_an_evaluation_is_stopped_between_chunks(evaluator: httpx.Client, served: Registry) -> None:

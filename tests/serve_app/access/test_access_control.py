@@ -154,10 +154,10 @@ def test_a_key_is_limited_to_its_scope(registry: Registry) -> None:
     }
     with serving_replica(registry) as client:
         for scope, token in tokens.items():
-            for (needed, (method, path)), shown in product(
+            for (needed, (method, path)), headers in product(
                 calls.items(), ({"x-api-key": token}, {"authorization": f"bEARER {token}"})
             ):
-                reply = client.request(method, path, json=BODY if needed == "act" else {}, headers=shown)
+                reply = client.request(method, path, json=BODY if needed == "act" else {}, headers=headers)
                 if scope != needed:
                     assert_rejected(reply, 403, "forbidden", f"scope {needed}", f"the key {scope} has {scope}")
                 else:
@@ -359,8 +359,8 @@ def test_each_request_is_a_line(registry: Registry, log: Path) -> None:
         client.get("/v1/leagues")
         client.post(ACTION, headers=bearer("nothing"))
         client.get("/v1/health/live")
-    found = lines(log)
-    assert [[line[name] for name in ("method", "route", "policy", "version", "status", "key")] for line in found] == [
+    logged = lines(log)
+    assert [[line[name] for name in ("method", "route", "policy", "version", "status", "key")] for line in logged] == [
         ["POST", ACTION, "board", 2, 200, "game-server"],
         ["POST", "/v2/models/board/versions/3/infer", "board", 3, 200, "game-server"],
         ["POST", ACTION, None, None, 400, "game-server"],
@@ -368,7 +368,7 @@ def test_each_request_is_a_line(registry: Registry, log: Path) -> None:
         ["POST", ACTION, None, None, 401, None],
         ["GET", "/v1/health/live", None, None, 200, None],
     ]
-    assert all(line["us"] > 0 and line["time"].endswith("Z") for line in found)
+    assert all(line["us"] > 0 and line["time"].endswith("Z") for line in logged)
     assert token not in log.read_text()
 
 
@@ -417,8 +417,8 @@ def test_an_error_has_the_status_of_its_class(subtests: pytest.Subtests) -> None
             status, body, headers = answer(error("a sentence"))
             assert body == {"code": error.code, "message": error("a sentence").public_message}
             assert ("retry-after" in headers) == (status in (429, 503))
-            known = [EXPECTED[ancestor.__name__] for ancestor in error.__mro__ if ancestor.__name__ in EXPECTED]
-            assert known[:1] in ([], [status])
+            statuses = [EXPECTED[ancestor.__name__] for ancestor in error.__mro__ if ancestor.__name__ in EXPECTED]
+            assert statuses[:1] in ([], [status])
 
 
 def test_paths_hosts_and_unexpected_exceptions_are_only_logged() -> None:
@@ -614,14 +614,14 @@ def test_a_stream_of_a_listed_origin_offers_its_key_as_a_subprotocol(registry: R
             assert stream.subprotocol == "policy-league"
             stream.send(json.dumps(BODY))
             assert json.loads(stream.recv(60))["version"] == 1
-        for others in (offered[:1], [offered[0], Subprotocol("policy-league.key.plk_wrong")]):
-            with pytest.raises(InvalidStatus) as refused, open_stream(subprotocols=others):
+        for subprotocols in (offered[:1], [offered[0], Subprotocol("policy-league.key.plk_wrong")]):
+            with pytest.raises(InvalidStatus) as refused, open_stream(subprotocols=subprotocols):
                 pass
             assert refused.value.response.status_code == 401
 
 
 def test_only_names_of_the_loopback_interface_are_accepted() -> None:
-    here = (
+    local = (
         "localhost",
         "LocalHost:8000",
         "league.localhost:8000",
@@ -632,7 +632,7 @@ def test_only_names_of_the_loopback_interface_are_accepted() -> None:
     )
     rebound = ("rebound.example", "rebound.example:8000", "localhost.rebound.example", "127.0.0.1.rebound.example")
     addresses = ("10.0.0.1:8000", "0.0.0.0:8000", "[::2]:8000", "[::1")
-    for host in here:
+    for host in local:
         reject_foreign_host([(b"accept", b"*/*"), (b"host", host.encode())])
     reject_foreign_host([(b"accept", b"*/*")])  # programs may send none
     for host in (*rebound, *addresses, "notlocalhost", "é", "", "localhost" * 1000):

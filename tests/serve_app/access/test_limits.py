@@ -32,6 +32,7 @@ from serve_app.access.request_body import decompressed, read_bytes
 from serve_app.app import Replica
 from serve_app.inference_protocol.rest_codec import MIN_COMPRESSED_BYTES, compressed
 from tests.support.clients.actions import inference
+from tests.support.examples import examples
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.replicas import QUICK
 
@@ -72,12 +73,12 @@ def test_a_key_is_found_by_its_token_only(api_keys: ApiKeyCache) -> None:
 
 
 def test_an_expired_or_revoked_key_is_not_found_but_the_cache_is_not_empty(api_keys: ApiKeyCache) -> None:
-    now = datetime.now(UTC)
-    for change in ({"expires_at": now - timedelta(seconds=1)}, {"revoked_at": now}):
+    date = datetime.now(UTC)
+    for change in ({"expires_at": date - timedelta(seconds=1)}, {"revoked_at": date}):
         api_keys.update([replace(ROW, **change)])
         assert api_keys.find(TOKEN) is None
         assert not api_keys.is_empty, "an empty cache would unlock the server"
-    api_keys.update([replace(ROW, expires_at=now + timedelta(hours=1))])
+    api_keys.update([replace(ROW, expires_at=date + timedelta(hours=1))])
     assert api_keys.find(TOKEN)
 
 
@@ -93,7 +94,7 @@ def test_an_update_does_not_reset_the_rate_limit(api_keys: ApiKeyCache) -> None:
 
 
 class Clock:
-    now = 100.0
+    now: float = 100.0
 
     def __call__(self) -> float:
         return self.now
@@ -112,15 +113,16 @@ def test_a_burst_of_one_second_is_allowed() -> None:
     assert slow.take() == 0
 
 
+@examples(60)
 @given(rate=st.floats(0.01, 1000), gaps=st.lists(st.floats(0, 2), min_size=1, max_size=200))
 def test_the_rate_plus_a_burst_is_never_exceeded(rate: float, gaps: list[float]) -> None:
     clock = Clock()
     bucket = TokenBucket(rate, clock)
-    begin, taken = clock.now, 0
+    begin, admitted = clock.now, 0
     for gap in gaps:
         clock.now += gap
-        taken += bucket.take() == 0
-        assert taken <= max(1, rate) + rate * (clock.now - begin) + 1e-6
+        admitted += bucket.take() == 0
+        assert admitted <= max(1, rate) + rate * (clock.now - begin) + 1e-6
 
 
 def test_tokens_can_be_owed_once() -> None:
@@ -339,14 +341,15 @@ async def test_a_change_without_its_body_is_not_applied(registry: Registry) -> N
     assert registry.aliases.current("board") == {"champion": 2}
 
 
+@examples(60)
 @given(
     body=st.binary(min_size=MIN_COMPRESSED_BYTES, max_size=4 * MIN_COMPRESSED_BYTES),
     encoding=st.sampled_from([b"gzip", b"deflate"]),
 )
 def test_bodies_survive_compression(body: bytes, encoding: bytes) -> None:
     async def round_trip() -> bytes:
-        compressed_body, chosen = await compressed(body, encoding)
-        assert chosen == encoding
+        compressed_body, content_encoding = await compressed(body, encoding)
+        assert content_encoding == encoding
         return await decompressed(compressed_body, encoding, len(body))
 
     assert asyncio.run(round_trip()) == body
@@ -371,6 +374,7 @@ def test_a_decompression_bomb_does_not_use_memory(monkeypatch: pytest.MonkeyPatc
     assert sizes == [2**20 + 1]
 
 
+@examples(60)
 @given(body=st.binary(max_size=100), encoding=st.sampled_from([b"gzip", b"deflate"]))
 def test_other_bytes_are_malformed(body: bytes, encoding: bytes) -> None:
     with pytest.raises(MalformedBody):

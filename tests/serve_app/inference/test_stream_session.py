@@ -1,17 +1,16 @@
 """Messages of a stream: their encoding, their answers, the state between them, and the version that answers."""
 
 import asyncio
-import json
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays as any_array
 from hypothesis.extra.numpy import from_dtype
@@ -34,7 +33,9 @@ from serve_app.inference.stream_batches import StreamBatches
 from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, BinaryCodec, encode_request, parse_request
 from serve_app.live_versions.version_cache import ActionSelections, LoadedPolicy, load
 from tests.support.clients.actions import BOARD, act, board_arrays, boards
-from tests.support.leagues.protocol_leagues import DTYPES, every_kind
+from tests.support.clients.streams import answer_to, open_stream, send
+from tests.support.examples import examples
+from tests.support.leagues.protocol_leagues import DTYPES
 from tests.support.leagues.served_leagues import promote, publish
 from tests.support.policies.graphs import counting, masked_mlp
 from tests.support.servers.exposition import value
@@ -44,23 +45,6 @@ from tests.support.waiting import until
 
 ONE = {"observation": [1]}
 BODY = {"observation": BOARD}
-
-
-def open_stream(client: TestClient, model: str = "board", query: str = "", **headers: str) -> WebSocketTestSession:
-    named = {name.replace("_", "-"): text for name, text in headers.items()}
-    return client.websocket_connect(f"/v1/policies/{model}/stream{query}", headers=named)
-
-
-def answer_to(stream: WebSocketTestSession, **message: Any) -> dict[str, Any]:
-    """The answer to a message, which must not be an error."""
-    answer = send(stream, message)
-    assert "code" not in answer, answer
-    return answer
-
-
-def send(stream: WebSocketTestSession, message: Any) -> dict[str, Any]:
-    stream.send_text(message if isinstance(message, str) else json.dumps(message))
-    return stream.receive_json()
 
 
 def binary(stream: WebSocketTestSession, message: bytes) -> tuple[np.ndarray, int]:
@@ -359,15 +343,6 @@ def test_revoking_a_key_ends_its_streams(client: TestClient, registry: Registry)
         assert (close.code, "bot was revoked" in close.reason) == (1008, True)
 
 
-def test_the_first_key_ends_an_idle_stream_without_one(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("serve_app.routes.stream.KEY_CHECK_INTERVAL", 0.1)
-    with replica(registry.storage) as client, open_stream(client) as stream:
-        registry.keys.create("bot", ["act"])
-        with pytest.raises(WebSocketDisconnect) as caught:
-            stream.receive_json()
-        assert (caught.value.code, caught.value.reason) == (1008, "this stream now requires an API key")
-
-
 def test_each_message_counts_for_the_rate_limit_of_a_key(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(api_keys, "TokenBucket", partial(TokenBucket, clock=lambda: 0.0))  # no time passes
     _, token = registry.keys.create("slow", ["act"], rate=0.5)
@@ -445,14 +420,12 @@ MAX_ROWS = 64
 
 
 @pytest.fixture(scope="module")
-def policies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, LoadedPolicy]:
-    registry = every_kind(Storage.at(tmp_path_factory.mktemp("framing")))
-    loaded = {
-        league: load(registry, league, 1, inline=1, selections=ActionSelections()).policy(None)
-        for league in ("kinds", "board", "vector", "chess", "memory")
-    }
-    registry.close()
-    return loaded
+def policies(leagues: Storage) -> dict[str, LoadedPolicy]:
+    with closing(Registry.open(leagues)) as registry:
+        return {
+            league: load(registry, league, 1, inline=1, selections=ActionSelections()).policy(None)
+            for league in ("kinds", "board", "vector", "chess", "memory")
+        }
 
 
 def leaves(dtype: str, rows: int) -> st.SearchStrategy[np.ndarray]:
@@ -481,7 +454,7 @@ def request_data(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(data=request_data(), has_resets=st.booleans())
 def test_requests_survive_encoding(policies: dict[str, LoadedPolicy], data: dict[str, Any], has_resets: bool) -> None:
     codec = BinaryCodec(policies["kinds"])
@@ -495,14 +468,15 @@ def test_requests_survive_encoding(policies: dict[str, LoadedPolicy], data: dict
     read = parse_request(message, MAX_ROWS)
     assert {name: getattr(read, name) for name in data.keys() - {"tensors"}}.items() <= data.items()
     assert (read.resets is not None) == has_resets
-    found = codec.read(read)
-    assert list(found) == names
+    decoded = codec.read(read)
+    assert list(decoded) == names
     for name, tensor in zip(names, tensors, strict=True):
-        np.testing.assert_array_equal(found[name], tensor)
-        assert found[name].dtype == tensor.dtype
-        assert found[name].flags.aligned
+        np.testing.assert_array_equal(decoded[name], tensor)
+        assert decoded[name].dtype == tensor.dtype
+        assert decoded[name].flags.aligned
 
 
+@examples(50)
 @given(resets=st.lists(st.booleans(), min_size=1, max_size=MAX_ROWS))
 def test_resets_are_parsed(policies: dict[str, LoadedPolicy], resets: list[bool]) -> None:
     rows = len(resets)
@@ -514,6 +488,7 @@ def test_resets_are_parsed(policies: dict[str, LoadedPolicy], resets: list[bool]
     np.testing.assert_array_equal(BinaryCodec(policies["memory"]).read(read)["observation"], observation)
 
 
+@examples(50)
 @given(rows=st.integers(1, MAX_ROWS), version=st.integers(1, 2**32 - 1), data=st.data())
 def test_replies_contain_the_actions(
     policies: dict[str, LoadedPolicy], rows: int, version: int, data: st.DataObject

@@ -7,16 +7,7 @@ import pytest
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
-from tests.support.leagues.protocol_leagues import every_kind
 from tests.support.servers.protocol_servers import SETTINGS, InProcess, Listening
-
-
-@pytest.fixture(scope="session")
-def leagues(tmp_path_factory: pytest.TempPathFactory) -> Storage:
-    """Leagues of each kind, for tests that do not change them."""
-    storage = Storage.at(tmp_path_factory.mktemp("inference"))
-    every_kind(storage).close()
-    return storage
 
 
 @pytest.fixture(scope="session")

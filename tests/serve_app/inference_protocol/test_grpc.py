@@ -274,7 +274,7 @@ def references(received: list[bytes]) -> list[int]:
 
 
 def test_local_and_remote_peers() -> None:
-    here = [
+    local = [
         "ipv4:127.0.0.1:4711",
         "ipv4:127.8.0.1:4711",
         "ipv6:[::1]:4711",
@@ -286,8 +286,8 @@ def test_local_and_remote_peers() -> None:
         "unix:/run/socket",
     ]
     elsewhere = ["ipv4:192.0.2.2:4711", "ipv6:[2001:db8::1]:4711", "ipv6:[::ffff:192.0.2.2]:4711"]
-    for peer in (*here, *elsewhere, "ipv4:127.0.0.1", "", "localhost"):
-        assert is_local_peer(peer, "192.0.2.1") is (peer in here), peer
+    for peer in (*local, *elsewhere, "ipv4:127.0.0.1", "", "localhost"):
+        assert is_local_peer(peer, "192.0.2.1") is (peer in local), peer
 
 
 INPUTS, OUTPUTS, PARAMETERS, RAW, UNKNOWN, GROUP = b"\x2a\0", b"\x32\0", b"\x22\0", b"\x3a\0", b"\x78\1", b"\x0b\x0c"

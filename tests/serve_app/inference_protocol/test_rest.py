@@ -21,7 +21,6 @@ from serve_app.inference_protocol.statistics import MAX_ENTRIES, Statistics, sum
 from tests.support.clients.actions import inference
 from tests.support.servers.protocol_servers import SETTINGS
 from tests.support.servers.replicas import READ_ONLY, local_client
-from tests.support.servers.replicas import replica as application
 
 LENGTH = "Inference-Header-Content-Length"
 VECTOR = {"name": "observation", "datatype": "FP32", "shape": [1, 2], "data": [0.5, -1]}
@@ -59,7 +58,8 @@ CHESS = [
 
 @pytest.fixture(scope="module")
 def client(leagues: Storage) -> Iterator[TestClient]:
-    with application(leagues, SETTINGS) as client:
+    # Another name: a replica that ends is removed from the registry, with its statistics.
+    with local_client(Replica(Registry.open(leagues), SETTINGS, "rest")) as client:
         yield client
 
 
@@ -85,7 +85,7 @@ def test_documents_are_those_of_the_protocol(client: TestClient) -> None:
     reply = infer(client, {"id": "tick", "inputs": [VECTOR], "outputs": [{"name": "action"}]})
     action = {"name": "action", "datatype": "FP32", "shape": [1, 2], "data": [0.5, -1]}
     assert reply.json() == {"model_name": "vector", "model_version": "1", "id": "tick", "outputs": [action]}
-    assert reply.headers["x-league-replica"] == "replica-1"
+    assert reply.headers["x-league-replica"] == "rest"
     assert LENGTH not in reply.headers
 
 
@@ -255,7 +255,7 @@ def test_a_large_response_is_compressed_if_accepted(client: TestClient) -> None:
 def test_metadata_without_a_database_lists_the_loaded_versions(
     leagues: Storage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with application(leagues, SETTINGS) as client:
+    with local_client(Replica(Registry.open(leagues), SETTINGS, "alone")) as client:
 
         def fail(*_: object) -> None:
             raise StorageError("the database is gone")

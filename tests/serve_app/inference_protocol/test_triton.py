@@ -1,7 +1,6 @@
 """Two clients of both protocols: the unmodified one in each form, and remote models as contestants of our versions."""
 
 import threading
-import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -113,20 +112,6 @@ def test_recurrent_state_is_an_input_and_an_output(triton: Triton) -> None:
     assert "state_in_<i>" in error_of(triton, "memory", {"observation": ones}, sequence_id=7, sequence_start=True)
 
 
-def test_both_directions_can_be_compressed(triton: Triton, leagues: Storage) -> None:
-    policy, signature = policy_of(leagues, "chess")
-    arrays = observations(signature, 2)
-    expected = policy.distribution(arrays).dist_inputs
-    assert expected is not None
-    for encoding in ("gzip", "deflate"):
-        # The asyncio client of tritonclient 2.41 cannot compress requests over HTTP: it does not import gzip.
-        names = ["response_compression_algorithm", "request_compression_algorithm"][: 1 if triton.is_async else 2]
-        options = dict.fromkeys(names if triton.is_http else ["compression_algorithm"], encoding)
-        for binary in (True, False):
-            result = triton.infer("chess", arrays, outputs=OUTPUTS, binary=binary, **options)
-            assert_same(result.as_numpy("action_dist_inputs"), expected)
-
-
 def test_health(triton: Triton) -> None:
     assert triton.call("is_server_live")
     assert triton.call("is_server_ready")
@@ -226,14 +211,6 @@ def test_invalid_requests_are_rejected(triton: Triton, leagues: Storage, subtest
         triton.infer("empty", valid)
     assert "unknown output 'value', expected action" in error_of(triton, "board", valid, outputs=["value"])
     assert "requested twice" in error_of(triton, "board", valid, outputs=["action", "action"])
-
-
-def test_a_decompression_bomb_is_rejected(clients: dict[str, Triton]) -> None:
-    limit = 512 * 1024
-    huge = np.zeros((8, limit // 2), np.int8)
-    message = error_of(clients["http"], "board", {"observation": huge}, request_compression_algorithm="gzip")
-    assert f"decompressed body is larger than {limit} bytes" in message
-    assert len(zlib.compress(huge.tobytes())) < limit // 50
 
 
 def test_unsupported_features_are_rejected(triton: Triton, leagues: Storage) -> None:

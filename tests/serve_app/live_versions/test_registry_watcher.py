@@ -200,28 +200,28 @@ def names(registry: Registry) -> set[str]:
 
 def test_a_replica_registers_before_it_reads_the_aliases(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise it could read an alias, and a promotion of that moment would wait for all replicas but this one."""
-    seen: list[set[str]] = []
+    registered: list[set[str]] = []
     read = AliasRepository.all
 
     def observed(aliases: AliasRepository) -> dict[tuple[str, str], AliasTarget]:
         # Servers of other tests in this process read their own database at the same time.
         if aliases._database.engine.url == registry.aliases._database.engine.url:
-            seen.append(names(registry))
+            registered.append(names(registry))
         return read(aliases)
 
     monkeypatch.setattr(AliasRepository, "all", observed)
     with replica(registry.storage):
         pass
-    assert seen[0] == {"replica-1"}
+    assert registered[0] == {"replica-1"}
     assert names(registry) == set()
 
 
 def test_replicas_that_ended_are_removed_and_silent_ones_are_not(registry: Registry) -> None:
-    here = dict(this_process().description)
-    machine, pid, _ = here["process"].rsplit(":", 2)
+    description = dict(this_process().description)
+    machine, pid, _ = description["process"].rsplit(":", 2)
     processes = {
         "ended": {"process": f"{machine}:{pid}:1"},
-        "stuck": here,
+        "stuck": description,
         "elsewhere": {"process": f"another:{pid}:1"},
     }
     for name, process in processes.items():

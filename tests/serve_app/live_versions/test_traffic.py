@@ -1,7 +1,6 @@
 """Which version answers which key: canaries and mixtures, and shadows, which are compared with the champion."""
 
 import asyncio
-import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from starlette.testclient import TestClient, WebSocketDenialResponse, WebSocketTestSession
+from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from league.errors import InvalidInput
 from league.policies import graph_runs
@@ -30,7 +29,17 @@ from serve_app.app import Replica
 from serve_app.live_versions.shadow import MAX_ROWS, MirroredRequest, Shadow, compare
 from serve_app.live_versions.traffic_split import key_position
 from serve_app.live_versions.version_cache import LoadedVersion
-from tests.support.clients.actions import BOARD, act, board_arrays, boards, inference, rejected, version_for
+from tests.support.clients.actions import (
+    BOARD,
+    act,
+    board_arrays,
+    boards,
+    change,
+    inference,
+    rejected,
+    version_for,
+)
+from tests.support.clients.streams import answer_to, open_stream
 from tests.support.leagues.served_leagues import everything, promote, publish
 from tests.support.policies.graphs import counting, endless_mlp, masked_mlp, memoryless
 from tests.support.servers.exposition import value
@@ -40,6 +49,7 @@ from tests.support.waiting import until
 
 TRAFFIC = "/v1/leagues/board/traffic"
 KEYS = [f"player-{number}" for number in range(200)]
+EPISODES = [f"episode-{number}" for number in range(24)]
 
 
 @given(st.binary(), st.floats(0, 1), st.floats(0, 1))
@@ -56,8 +66,8 @@ def test_keys_are_spread_evenly_and_differently_in_each_league() -> None:
     assert key_position("board", b"player-0") == 0.47714954489280714, "stable across replicas and releases"
 
 
-def versions_by_key(client: TestClient, keys: list[str] = KEYS) -> dict[str, int]:
-    return {key: version_for(client, key) for key in keys}
+def versions_by_key(client: TestClient) -> dict[str, int]:
+    return {key: version_for(client, key) for key in EPISODES}
 
 
 def set_traffic(registry: Registry, **portions: Any) -> Callable[[], bool]:
@@ -67,14 +77,10 @@ def set_traffic(registry: Registry, **portions: Any) -> Callable[[], bool]:
 
 
 def test_a_canary_answers_its_share_of_keys(client: TestClient, registry: Registry) -> None:
-    until(set_traffic(registry, canary=Portion(2, 0.25)))
-    quarter = versions_by_key(client)
-    assert 20 < Counter(quarter.values())[2] < 80
-    assert versions_by_key(client) == quarter, "each key keeps its version"
-    until(set_traffic(registry, canary=Portion(2, 0.5)))
-    half = versions_by_key(client)
-    assert all(half[key] == 2 for key, version in quarter.items() if version == 2)
-    assert Counter(half.values())[2] > Counter(quarter.values())[2]
+    for share in (0.25, 0.5):
+        until(set_traffic(registry, canary=Portion(2, share)))
+        expected = {key: 1 + (key_position("board", key.encode()) < share) for key in EPISODES}
+        assert versions_by_key(client) == versions_by_key(client) == expected
     promote(registry, "board", 2)
     until(lambda: version_for(client) == 2)
     assert set(versions_by_key(client).values()) == {2}
@@ -117,30 +123,15 @@ def test_inference_has_the_same_canary(client: TestClient, registry: Registry) -
         assert int(reply.json()["model_version"]) == version_for(client, key)
 
 
-@pytest.fixture
-def promoter(registry: Registry) -> Iterator[TestClient]:
-    _, token = registry.keys.create("release-bot", ["promote", "read", "act"])
-    with replica(registry.storage) as client:
-        client.headers["authorization"] = f"Bearer {token}"
-        yield client
-
-
-def change(client: TestClient, body: Any, key: str = "a", status: int = 200) -> dict[str, Any]:
-    reply = client.post(TRAFFIC, content=json.dumps(body), headers={"idempotency-key": key})
-    assert reply.status_code == status, reply.text
-    return reply.json()
-
-
 def test_traffic_is_set_over_http(promoter: TestClient, registry: Registry) -> None:
     body = {"canary": {"version": 2, "share": 0.05}, "reason": "try it"}
-    response = change(promoter, body)
+    response = change(promoter, TRAFFIC, "a", body)
     assert (response["canary"], response["shadow"]) == ({"version": 2, "share": 0.05}, None)
     assert (response["actor"], response["reason"]) == ("release-bot", "try it")
-    assert change(promoter, body) == response, "a repeated call has the same response"
-    assert change(promoter, {"shadow": {"version": "3", "share": 1}}, "b")["canary"] == response["canary"], (
-        "the canary remains"
-    )
-    both = change(promoter, {"canary": None, "shadow": None}, "c")
+    assert change(promoter, TRAFFIC, "a", body) == response, "a repeated call has the same response"
+    shadow = {"shadow": {"version": "3", "share": 1}}
+    assert change(promoter, TRAFFIC, "b", shadow)["canary"] == response["canary"], "the canary remains"
+    both = change(promoter, TRAFFIC, "c", {"canary": None, "shadow": None})
     assert (both["canary"], both["shadow"]) == (None, None)
     assert [one.canary and one.canary.share for one in registry.traffic.history("board")] == [None, 0.05, 0.05]
     until(lambda: promoter.get(TRAFFIC).json()["replicas"][0]["follows"])
@@ -158,25 +149,11 @@ def test_invalid_traffic_is_rejected(promoter: TestClient, registry: Registry, s
         ({"canarie": None}, 400, "invalid_input"),
     ):
         with subtests.test(body=body):
-            assert change(promoter, body, status=status)["code"] == code
+            assert change(promoter, TRAFFIC, "a", body, status)["code"] == code
     assert registry.traffic.current("board").id is None
 
 
-EPISODES = [f"episode-{number}" for number in range(24)]
-
-
 MEMBERS = {1: OnnxPolicy(masked_mlp(seed=0)), 3: OnnxPolicy(masked_mlp(seed=2))}
-
-
-def open_stream(client: TestClient, query: str = "", model: str = "board", **headers: str) -> WebSocketTestSession:
-    return client.websocket_connect(f"/v1/policies/{model}/stream{query}", headers=headers)
-
-
-def answer_to(stream: WebSocketTestSession, **message: Any) -> dict[str, Any]:
-    stream.send_text(json.dumps(message))
-    answer = json.loads(stream.receive_text())
-    assert "code" not in answer, answer
-    return answer
 
 
 def mix(registry: Registry, shares: dict[int, float], league: str = "board") -> Mixture:
@@ -228,13 +205,6 @@ def test_descriptions_name_the_members(mixed: tuple[TestClient, Mixture]) -> Non
     assert [row["members"] for row in versions] == [None, None, None, members]
     assert versions[3]["role"] == "mixture"
     until(lambda: value(client, "league_live_version", league="board", alias="champion") == 4)
-
-
-def test_requests_are_counted_by_member(client: TestClient, registry: Registry) -> None:
-    mix(registry, {1: 0.5, 3: 0.5})
-    answered = Counter(version_for(client, key) for key in EPISODES)
-    for version, count in answered.items():
-        until(lambda v=version, c=count: value(client, "league_request_seconds_count", version=str(v)) == c)
     assert value(client, "league_mixture_probability", league="board", alias="champion", version="3") == 0.5
 
 
@@ -274,7 +244,7 @@ def test_an_episode_continues_in_a_stream_whose_alias_is_not_recurrent_now(
     state = act(client, "memory", observation=[2.0])["state"]
     promote(registry, "memory", 2)
     registry.changes.wait_for_alias(registry.aliases.history("memory")[0], 30)
-    with open_stream(client, "?follow=champion", "memory") as stream:
+    with open_stream(client, "memory", "?follow=champion") as stream:
         answer = answer_to(stream, observation=[1.0], state=state, return_state=True)
         assert (answer["version"], answer["action"]) == (1, 1), "the sum of the episode exceeds 2"
         assert answer_to(stream, observation=[1.0], reset=True)["version"] == 2
@@ -287,7 +257,7 @@ def test_a_stream_continues_with_its_member_after_reconnecting(mixed: tuple[Test
         protocol = StreamProtocol(Endpoint("http://localhost", None, None, 5.0), parse_model("board"), follow=True)
         versions = []
         for connection in range(3):
-            with open_stream(client, "?" + protocol.url.partition("?")[2]) as stream:
+            with open_stream(client, query="?" + protocol.url.partition("?")[2]) as stream:
                 protocol.opened({"x-league-version": "1"})
                 for reset in (connection == 0, False):
                     stream.send_text(protocol.message(request, reset))
@@ -301,10 +271,10 @@ def test_a_stream_continues_with_its_member_after_reconnecting(mixed: tuple[Test
 def test_only_a_number_accompanies_follow(mixed: tuple[TestClient, Mixture]) -> None:
     """A version that is no member is ignored: the alias has moved."""
     client, _ = mixed
-    with open_stream(client, "?follow=champion&version=2") as stream:
+    with open_stream(client, query="?follow=champion&version=2") as stream:
         assert answer_to(stream, observation=BOARD)["version"] in (1, 3)
     query = "?follow=champion&version=champion"
-    with pytest.raises(WebSocketDenialResponse) as refused, open_stream(client, query):
+    with pytest.raises(WebSocketDenialResponse) as refused, open_stream(client, query=query):
         pass
     assert refused.value.status_code == 400
 
@@ -312,15 +282,15 @@ def test_only_a_number_accompanies_follow(mixed: tuple[TestClient, Mixture]) -> 
 def test_a_stream_changes_its_member_when_an_episode_starts(mixed: tuple[TestClient, Mixture]) -> None:
     client, mixture = mixed
     members = set()
-    with open_stream(client, "?follow=champion") as stream:
+    with open_stream(client, query="?follow=champion") as stream:
         for _ in range(20):
             first = answer_to(stream, observation=BOARD, reset=True)["version"]
             assert {answer_to(stream, observation=BOARD)["version"] for _ in range(4)} == {first}
             members.add(first)
     assert members == {1, 3}
-    pinned = [("", {}, None), *(("?follow=champion", {"x-league-key": key}, key) for key in EPISODES[:6])]
+    pinned = [("", {}, None), *(("?follow=champion", {"x_league_key": key}, key) for key in EPISODES[:6])]
     for query, headers, key in pinned:
-        with open_stream(client, query, **headers) as stream:
+        with open_stream(client, query=query, **headers) as stream:
             versions = {answer_to(stream, observation=BOARD, reset=True)["version"] for _ in range(20)}
         assert len(versions) == 1
         assert key is None or versions == {mixture.version_of("board", key.encode())}
@@ -328,31 +298,31 @@ def test_a_stream_changes_its_member_when_an_episode_starts(mixed: tuple[TestCli
 
 def test_aliases_move_to_a_mixture_and_back(client: TestClient, registry: Registry) -> None:
     mix(registry, {1: 0.5, 3: 0.5})
-    before = versions_by_key(client, EPISODES)
+    before = versions_by_key(client)
     assert set(before.values()) == {1, 3}
     mix(registry, {1: 0.5, 2: 0.5})
-    after = versions_by_key(client, EPISODES)
+    after = versions_by_key(client)
     assert all((after[key] == 1) == (version == 1) for key, version in before.items()), "the others keep their member"
     event = registry.aliases.rollback("board", actor="test", reason="test")
     registry.changes.wait_for_alias(event, 30)
-    assert versions_by_key(client, EPISODES) == before
+    assert versions_by_key(client) == before
     promote(registry, "board", 2)
     registry.changes.wait_for_alias(registry.aliases.history("board")[0], 30)
-    assert set(versions_by_key(client, EPISODES).values()) == {2}
+    assert set(versions_by_key(client).values()) == {2}
 
 
 def test_a_mixture_is_a_canary_and_is_compared_with_a_shadow(client: TestClient, registry: Registry) -> None:
     number = registry.publisher.publish_mixture("board", {2: 0.5, 3: 0.5}).number
     setting = registry.traffic.set("board", canary=Portion(number, 0.5), actor="test", reason="test")
     registry.changes.wait_for_traffic(setting, 30)
-    counts = Counter(versions_by_key(client, EPISODES).values())
+    counts = Counter(versions_by_key(client).values())
     assert counts.keys() == {1, 2, 3}
-    shown = client.get("/v1/leagues/board/traffic").json()["here"]["versions"]
-    assert {row["version"]: row["as_canary"] for row in shown} == {1: 0, 2: counts[2], 3: counts[3]}
+    rows = client.get("/v1/leagues/board/traffic").json()["here"]["versions"]
+    assert {row["version"]: row["as_canary"] for row in rows} == {1: 0, 2: counts[2], 3: counts[3]}
     setting = registry.traffic.set("board", canary=None, shadow=Portion(3, 1.0), actor="test", reason="test")
     mix(registry, {1: 0.5, 2: 0.5})
     registry.changes.wait_for_traffic(setting, 30)
-    versions_by_key(client, EPISODES)
+    versions_by_key(client)
     until(
         lambda: {(one.candidate, one.champion) for one in registry.traffic.shadow_counts("board")} == {(3, 1), (3, 2)}
     )

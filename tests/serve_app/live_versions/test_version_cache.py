@@ -256,27 +256,6 @@ async def test_a_tampered_version_does_not_go_live(
     assert (number(slots), slots.faults()) == (2, {})
 
 
-async def test_a_damaged_version_does_not_go_live(slots: AliasSlots, registry: Registry) -> None:
-    path = graph(registry, 2)
-    manifest = path.with_name("manifest.json")
-    content, text = path.read_bytes(), manifest.read_text()
-    for damage in (
-        lambda: path.write_bytes(content[:100]),
-        lambda: path.write_bytes(b""),
-        lambda: path.write_bytes(graph(registry, 3).read_bytes()),
-        path.unlink,
-        lambda: manifest.write_text(text.replace('"steps": 2', '"steps": 3')),
-        lambda: path.with_name("extra.bin").write_bytes(b"code"),
-    ):
-        await follow(slots, {CHAMPION: 1, OTHER: 1})
-        assert (number(slots), slots.faults()) == (1, {}), "going back clears the fault"
-        damage()
-        await follow(slots, {CHAMPION: 2, OTHER: 1})
-        assert (number(slots), slots.faults().keys()) == (1, {"board"})
-        path.write_bytes(content)
-        manifest.write_text(text)
-
-
 async def test_only_the_files_that_are_served_are_read(slots: AliasSlots, registry: Registry) -> None:
     """The state of training can be as large as a disk is slow."""
     state = registry.artifacts.path("board", 2) / "training" / "state"
@@ -324,12 +303,14 @@ async def test_a_later_update_replaces_a_stalled_load(stalled: Loader) -> None:
 
 
 async def test_a_load_that_takes_too_long_is_a_fault_until_it_succeeds(stalled: Loader) -> None:
-    slots = AliasSlots(VersionCache(stalled, capacity=1, retry=0, timeout=0.5))
+    versions = VersionCache(stalled, capacity=1, retry=0)
+    slots = AliasSlots(versions)
     await follow(slots, {CHAMPION: 1})
+    versions._timeout = 0.01
     await follow(slots, {CHAMPION: 2})
     assert number(slots) == 1
     assert slots.is_settled
-    assert "board@2 was not loaded within 0.5 s" in (slots.faults().get("board") or "")
+    assert "board@2 was not loaded within 0.01 s" in (slots.faults().get("board") or "")
     await follow(slots, {CHAMPION: 2})
     stalled.gate.set()
     while number(slots) != 2:

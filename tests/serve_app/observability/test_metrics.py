@@ -170,12 +170,12 @@ def report(**counts: list[int]) -> Report:
 
 
 def test_a_rate_covers_the_time_since_the_last_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 100.0
-    monkeypatch.setattr(metrics_reporter, "monotonic", lambda: now)
+    time = 100.0
+    monkeypatch.setattr(metrics_reporter, "monotonic", lambda: time)
     rates = RequestRates()
-    now = 104.0
+    time = 104.0
     assert rates.since_last(report(board=[8, 4], duo=[0])) == [[["board"], 3.0], [["duo"], 0.0]]
-    now = 106.0
+    time = 106.0
     assert rates.since_last(report(board=[9, 5], duo=[10])) == [[["board"], 1.0], [["duo"], 5.0]]
     assert rates.since_last(report(board=[2])) == [[["board"], 0.0]], "counts may decrease"
 

@@ -108,13 +108,15 @@ def codes_of(openapi: dict[str, Any], response: Any) -> list[str]:
 
 
 def subclasses(error: type[LeagueError]) -> Iterator[type[LeagueError]]:
-    for each in error.__subclasses__():
-        yield each
-        yield from subclasses(each)
+    for subclass in error.__subclasses__():
+        yield subclass
+        yield from subclasses(subclass)
 
 
 def test_each_code_is_listed_under_its_status(openapi: dict[str, Any]) -> None:
-    statuses = {each.code: status_of(each()) for each in subclasses(LeagueError) if each.__init__ is Exception.__init__}
+    statuses = {
+        error.code: status_of(error()) for error in subclasses(LeagueError) if error.__init__ is Exception.__init__
+    }
     statuses |= {code: status for status, code in CODES.items()} | {"internal_error": 500, "rate_limited": 429}
     documented = set()
     for path, _, operation in operations(openapi):
@@ -168,7 +170,7 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 def examples(client: TestClient, path: str) -> dict[str, Any]:
     post = client.get("/openapi.json").json()["paths"][path]["post"]
     every = post["requestBody"]["content"]["application/json"]["examples"].values()
-    return {each["x-model"]: each["value"] for each in every if "x-model" in each}
+    return {example["x-model"]: example["value"] for example in every if "x-model" in example}
 
 
 def test_each_served_policy_has_a_valid_action_example(kinds: TestClient) -> None:
@@ -232,10 +234,10 @@ def test_the_page_loads_no_other_resources_and_runs_its_own_script_only(read_onl
 def test_examples_require_permission_to_read(client: TestClient, registry: Registry) -> None:
     def is_shown(token: str | None = None) -> bool:
         headers = {} if token is None else {"x-api-key": token}
-        shown = client.get("/openapi.json", headers=headers).json()
+        content = client.get("/openapi.json", headers=headers).json()
         for name in ("Playability", "PlayableAgent"):  # a property `board`, and KeyboardEvent
-            del shown["components"]["schemas"][name]
-        return re.search("(?<![Ll]eader)board", json.dumps(shown)) is not None
+            del content["components"]["schemas"][name]
+        return re.search("(?<![Ll]eader)board", json.dumps(content)) is not None
 
     assert is_shown()
     _, reader = registry.keys.create("reader", ["read"])

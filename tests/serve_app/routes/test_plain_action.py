@@ -89,7 +89,7 @@ def test_plain_requests_take_the_fast_path(replica: Connections, subtests: pytes
                 assert answer == exchange(replica.general, data)
 
 
-OTHERS: dict[str, bytes] = {
+OTHERS: dict[str, bytes] = {  # besides those that are generated
     "explore": request({"observation": BOARD, "explore": True, "seed": 3}),
     "probabilities": request({"observation": BOARD, "probabilities": True}),
     "a version": request({"observation": BOARD}, query="?version=2"),
@@ -97,7 +97,6 @@ OTHERS: dict[str, bytes] = {
     "an unknown league": request({"observation": BOARD}, model="nobody"),
     "an unknown policy": request({"observation": BOARD}, model="board.nobody"),
     "no champion": request({"observation": BOARD}, model="empty"),
-    "no policy": request({"observation": BOARD}, model="duo"),
     "no model": request({"observation": BOARD}, model=""),
     "a slash": request({"observation": BOARD}, model="board/shared"),
     "recurrent": request({"observation": [0.5]}, model="memory"),
@@ -112,7 +111,6 @@ OTHERS: dict[str, bytes] = {
     "too many": request({"observations": boards(9)}),
     "large": request({"observation": BOARD, "seed": [1] * 20_000}),
     "too large": request({"observation": BOARD, "seed": [1] * 40_000}),
-    "booleans": request({"observation": BOARD | {"action_mask": [True] * 7}}),
     "illegal": request({"observation": BOARD | {"action_mask": [0] * 7}}),
     "binary, a response to compress": infer(
         {"observation": np.zeros((8, 6, 7, 2), np.int8), "action_mask": np.ones((8, 7), np.int8)},
@@ -120,18 +118,11 @@ OTHERS: dict[str, bytes] = {
         more={"Accept-Encoding": "gzip"},
     ).replace(b'"binary_data":true', b'"binary_data":null'),
     "binary, illegal": infer({**binary_boards(1), "action_mask": np.zeros((1, 7), np.int8)}),
-    "binary, an infinity": infer({"observation": np.array([[np.inf, 0]], np.float32)}, "vector"),
-    "binary, out of range": infer(SENSES | {"observation.mode": np.array([9, 1])}, "nested"),
     "binary, an input is missing": infer({"observation": binary_boards(1)["observation"]}),
     "binary, unequal rows": infer(binary_boards(2) | {"action_mask": np.ones((1, 7), np.int8)}),
-    "binary, too many": infer(binary_boards(9)),
-    "binary, another datatype": infer({"observation": np.zeros((1, 2))}, "vector"),
-    "binary, an unknown output": infer(binary_boards(1), outputs=["value"]),
-    "binary, recurrent": infer({"observation": np.zeros((1, 1), np.float32)}, "memory"),
     "binary, an unknown version": infer(binary_boards(1), "board/versions/9"),
     "binary, no version": infer(binary_boards(1), "board/versions/"),
     "binary, an encoding": infer(binary_boards(1), more={"Content-Encoding": "gzip"}),
-    "binary, a wrong length": infer(binary_boards(1), more={"Inference-Header-Content-Length": "soon"}),
     "a duplicate key": request(b'{"observation": [1, 0], "observation": [0, 1]}', model="vector"),
     **{f"invalid: {name}": request(body, model) for name, (model, body, *_) in INVALID.items()},
 }

@@ -245,8 +245,8 @@ def test_a_node_has_the_limits(tmp_path: Path) -> None:
         assert "timeout check 5s" in amended, "a busy replica has more time than the interval of health checks"
         assert f"bind 127.0.0.1:{stats}" in amended, "statistics are for this machine only"
         assert f"bind 127.0.0.1:{metrics}" in amended
-    shown = subprocess.run([COMMAND, "-v"], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
-    assert (shown.returncode, shown.stdout[:15]) == (0, "HAProxy version"), "without a configuration"
+    process = subprocess.run([COMMAND, "-v"], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
+    assert (process.returncode, process.stdout[:15]) == (0, "HAProxy version"), "without a configuration"
 
 
 def installed(directory: Path) -> Path:
@@ -376,9 +376,9 @@ def test_a_replica_that_ends_before_it_responds_is_reported(tmp_path: Path) -> N
                             connection.sendall(b"HTTP/1.1 200")
 
         threading.Thread(target=begin_a_response, daemon=True).start()
-        found = refused(tmp_path, "/v1/leagues", replica.getsockname()[1])
+        refusal = refused(tmp_path, "/v1/leagues", replica.getsockname()[1])
         replica.shutdown(socket.SHUT_RDWR)
-    assert found == {"status": "502", "code": "replica_lost"}
+    assert refusal == {"status": "502", "code": "replica_lost"}
 
 
 CONNECTIONS = 40

@@ -25,7 +25,7 @@ from starlette.types import Receive, Scope, Send
 from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
 from league.registry.replicas import LIVENESS_TIMEOUT
 from league.settings import Storage
-from serve_app.runtime import launch, serve_bypass
+from serve_app.runtime import haproxy, launch, serve_bypass
 from serve_app.runtime.autoscaling import LOAD, MARGIN, STALE, LoadPolicy, required_replicas
 from serve_app.runtime.launch import DEPLOY_YAML, load_document, running
 from serve_app.runtime.replica_process import has_ended, this_process
@@ -38,22 +38,21 @@ def load(deploy: Path = DEPLOY_YAML, replicas: int | None = None, max_replicas: 
     return load_document(deploy, None, None, None, replicas, max_replicas, insecure=False)
 
 
-def test_a_port_in_use_is_reported(storage: Storage) -> None:
+def test_a_port_in_use_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        for option in ("port", "grpc_port"):
-            with (
-                pytest.raises(AlreadyRunning, match=f"port {port} of 127.0.0.1 is in use"),
-                running(storage, **{option: port}),  # type: ignore[arg-type]
-            ):
-                pass
+        (free,) = haproxy.free_ports(1, "127.0.0.1")
+        for http, grpc in ((port, free), (free, port)):
+            document = load_document(DEPLOY_YAML, None, http, grpc, None, None, insecure=False)
+            with pytest.raises(AlreadyRunning, match=f"port {port} of 127.0.0.1 is in use"):
+                launch._serve_locally(document, dashboard=False, on_ready=None)
 
 
-def test_invalid_settings_are_reported(storage: Storage, tmp_path: Path) -> None:
+def test_invalid_settings_are_reported(tmp_path: Path) -> None:
     deploy = tmp_path / "deploy.yaml"
     deploy.write_text(DEPLOY_YAML.read_text().replace("    args:\n", "    args:\n      max_body: 1\n"))
-    with pytest.raises(ConfigError, match="max_body"), running(storage, deploy=deploy):
-        pass
+    with pytest.raises(ConfigError, match="max_body"):
+        launch._settings(load(deploy))
 
 
 def test_an_invalid_deploy_yaml_is_reported(tmp_path: Path) -> None:
@@ -75,8 +74,8 @@ def test_an_unusable_home_and_a_missing_haproxy_are_reported(
     storage: Storage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("not a directory")
-    with pytest.raises(StorageError, match="file"), running(Storage.at(tmp_path / "file" / "home")):
-        pass
+    with pytest.raises(StorageError, match="file"):
+        launch._check_exposure(load(), Storage.at(tmp_path / "file" / "home"))
     monkeypatch.setenv("RAY_SERVE_HAPROXY_BINARY_PATH", "/nowhere/haproxy")
     with pytest.raises(NotReady, match="HAProxy is missing"), running(storage):
         pass
@@ -178,46 +177,43 @@ def test_all_but_loopback_addresses_are_exposed() -> None:
         assert is_exposed(host)
 
 
-DESCRIBE = "from serve_app.runtime.replica_process import this_process; print(this_process().description['process'])"
-
-
-def test_which_processes_have_ended() -> None:
-    """Nothing is known of a replica that does not describe its process: another release may use other keys."""
-    described = subprocess.run([sys.executable, "-c", DESCRIBE], stdout=subprocess.PIPE, text=True, check=True).stdout
-    assert has_ended({"process": described.strip()})
-    for description in (this_process().description, {"machine": "another/1", "pid": "1", "start": "1"}, {}):
-        assert not has_ended(description)
-
-
-WITHOUT_PANDAS = """
+REPLICA = """
 import sys
 from serve_app.runtime.worker_start import import_serve
 
 import_serve()
 print({"pandas", "pyarrow", "sqlalchemy"} & sys.modules.keys())
+import serve_app.app, serve_app.runtime.serve_bypass
+heavy = {"torch", "pettingzoo", "supersuit", "mpe2", "tensorflow"} & {name.partition(".")[0] for name in sys.modules}
+print(heavy | {name for name in sys.modules if name.startswith(("ray.rllib", "league.environments"))})
+print(serve_app.runtime.replica_process.this_process().description["process"])
 import pandas
 from ray.serve._private import utils
 print(utils.pd)
 """
 
 
-def test_ray_serve_is_imported_without_pandas_which_others_can_import() -> None:
-    done = subprocess.run([sys.executable, "-c", WITHOUT_PANDAS], capture_output=True, text=True, timeout=120)
-    assert done.stdout.split("\n") == ["set()", "None", ""], done.stderr
+@pytest.fixture(scope="module")
+def printed() -> list[str]:
+    """What a process prints that imports the modules of a replica."""
+    process = subprocess.run([sys.executable, "-c", REPLICA], capture_output=True, text=True, timeout=120)
+    assert process.returncode == 0, process.stderr
+    return process.stdout.splitlines()
 
 
-IMPORTS = """
-import sys
-import serve_app.app, serve_app.runtime.serve_bypass
-heavy = {name.partition(".")[0] for name in sys.modules} & {"torch", "pettingzoo", "supersuit", "mpe2", "tensorflow"}
-heavy |= {name for name in sys.modules if name.startswith(("ray.rllib", "league.environments"))}
-print(*sorted(heavy))
-"""
+def test_which_processes_have_ended(printed: list[str]) -> None:
+    """Nothing is known of a replica that does not describe its process: another release may use other keys."""
+    assert has_ended({"process": printed[2]})
+    for description in (this_process().description, {"machine": "another/1", "pid": "1", "start": "1"}, {}):
+        assert not has_ended(description)
 
 
-def test_a_replica_imports_neither_torch_nor_environments() -> None:
-    process = subprocess.run([sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=True)
-    assert process.stdout.split() == []
+def test_ray_serve_is_imported_without_pandas_which_others_can_import(printed: list[str]) -> None:
+    assert (printed[0], printed[3]) == ("set()", "None")
+
+
+def test_a_replica_imports_neither_torch_nor_environments(printed: list[str]) -> None:
+    assert printed[1] == "set()"
 
 
 @pytest.fixture
@@ -261,8 +257,8 @@ def test_the_rest_of_the_server_sees_paths_without_the_root_path(monkeypatch: py
     monkeypatch.setattr(serve_bypass, "_application", None)
     monkeypatch.setattr(serve_bypass, "_root_path", "/ai")
     client = TestClient(serve_bypass.ServeBypass(echo))
-    shown = [client.get(path).text for path in ("/ai", "/ai/", "/ai/leagues/a%2Fb", "/aims")]
-    assert shown == ["/ /", "/ /", "/leagues/a/b /leagues/a%2Fb", "/aims /aims"]
+    paths = [client.get(path).text for path in ("/ai", "/ai/", "/ai/leagues/a%2Fb", "/aims")]
+    assert paths == ["/ /", "/ /", "/leagues/a/b /leagues/a%2Fb", "/aims /aims"]
 
 
 LONG = 60.0
@@ -281,10 +277,10 @@ async def test_waiting_work_gets_results_and_errors() -> None:
     async def work(future: asyncio.Future[int]) -> int:
         await asyncio.sleep(0)
         try:
-            found = await future
+            number = await future
         except ZeroDivisionError:
-            found = -1
-        return found + await asyncio.to_thread(lambda: 1)
+            number = -1
+        return number + await asyncio.to_thread(lambda: 1)
 
     loop = asyncio.get_running_loop()
     good, bad = loop.create_future(), loop.create_future()
@@ -346,7 +342,7 @@ async def test_a_cancelled_caller_cancels_the_work() -> None:
 TARGET = 0.6
 targets = st.floats(0.2, 0.9)
 loads = st.lists(st.none() | st.floats(0, 4), max_size=20)
-bounds = st.tuples(st.integers(1, 10), st.integers(0, 10)).map(lambda each: (each[0], sum(each)))
+bounds = st.tuples(st.integers(1, 10), st.integers(0, 10)).map(lambda pair: (pair[0], sum(pair)))
 
 
 @given(loads, targets, st.integers(0, 30), bounds)
@@ -360,11 +356,11 @@ def test_the_bounds_are_respected(
 def test_more_load_needs_no_fewer_replicas(
     load: float, others: list[float | None], target: float, current: int, more: float
 ) -> None:
-    light, heavy = ([each, *others] for each in (load, load + more))
+    light, heavy = ([first, *others] for first in (load, load + more))
     assert required_replicas(heavy, target, current, 1, 99) >= required_replicas(light, target, current, 1, 99)
 
 
-@given(loads.filter(lambda each: None in each), targets, st.integers(1, 30))
+@given(loads.filter(lambda numbers: None in numbers), targets, st.integers(1, 30))
 def test_no_replica_is_removed_while_a_load_is_unknown(loads: list[float | None], target: float, current: int) -> None:
     assert required_replicas(loads, target, current, 1, 99) >= current
 
@@ -385,7 +381,7 @@ def test_a_constant_load_gets_a_constant_number(
     numbers = [current]
     for row in np.random.default_rng(seed).uniform(0.9, 1.1, size=(30, 20)).tolist():
         share = min(1.0, demand / numbers[-1] + overhead)
-        numbers.append(required_replicas([share * each for each in row[: numbers[-1]]], target, numbers[-1], 1, 20))
+        numbers.append(required_replicas([share * noise for noise in row[: numbers[-1]]], target, numbers[-1], 1, 20))
     grows = [after > before for before, after in pairwise(numbers) if after != before]
     assert grows == sorted(grows, reverse=True)
     assert numbers[-1] == numbers[-2]
@@ -432,8 +428,8 @@ class Controller:
             policy_state=dict(self.state),
             current_time=self.now,
         )
-        wanted, self.state = policy(context)
-        return wanted
+        number, self.state = policy(context)
+        return number
 
 
 def test_the_load_is_the_mean_of_the_samples() -> None:
@@ -448,7 +444,7 @@ def test_statistics_that_no_longer_change_are_unknown() -> None:
     """Clocks of nodes differ: the age of a report is the time since it arrived."""
     controller, policy = Controller(2), LoadPolicy(TARGET)
     alive, stuck = controller.replicas
-    controller.reports = {each: [TimeStampedValue(5e9, 0.01)] for each in controller.replicas}
+    controller.reports = {replica: [TimeStampedValue(5e9, 0.01)] for replica in controller.replicas}
     assert controller.decide(policy) == 1
     controller.now += STALE + 1
     controller.reports[alive] = [TimeStampedValue(5e9 + 1, 0.01)]

@@ -226,11 +226,11 @@ def test_connections_are_accepted_in_order() -> None:
         connections = [socket.create_connection(server.getsockname()) for _ in range(3)]
         until(lambda: queue.length() == 3)
         for connection in connections:
-            taken = queue.take()
-            assert taken is not None
-            assert taken.getpeername() == connection.getsockname()
-            assert not taken.getblocking()
-            taken.close()
+            accepted = queue.take()
+            assert accepted is not None
+            assert accepted.getpeername() == connection.getsockname()
+            assert not accepted.getblocking()
+            accepted.close()
             connection.close()
         assert queue.take() is None
 

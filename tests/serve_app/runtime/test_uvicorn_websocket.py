@@ -185,7 +185,7 @@ class RawClient:
     def flood(self, message: bytes) -> int:
         """Send a message repeatedly without reading, until no more is accepted; returns the number of bytes."""
         sent = 0
-        self.socket.settimeout(0.3)
+        self.socket.settimeout(0.15)
         with suppress(TimeoutError):
             while True:
                 assert sent < 200 * 2**20, "the server does not stop reading"
@@ -311,8 +311,9 @@ def test_frames_without_a_key_share_a_rate(storage: Storage, monkeypatch: pytest
         raw.socket.close()
 
 
-def test_incomplete_messages_have_limited_memory(storage: Storage) -> None:
+def test_incomplete_messages_have_limited_memory(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
     """The stream that exceeds the limit is closed, unless it holds little; others are not affected."""
+    monkeypatch.setattr(uvicorn_websocket, "CLOSE_TIMEOUT", 0.1)  # a message is still incomplete
     settings = QUICK.model_copy(update={"max_body": 2**20, "max_batch": 1024, "max_incomplete": 300_000})
     half = frame(b" " * 200_000, 0x01)
     with listening(storage, settings) as listener:
@@ -365,7 +366,7 @@ INVALID_FRAMES = (
     (b"\x82\xff" + struct.pack(">Q", 2**63) + b"\1\2\3\4", 1009),
     (frame(b" " * (64 * 1024 + 1)), 1009),
     (frame(b" " * 2**15, 0x01) + frame(b" " * 2**15, 0x00) + frame(b" ", 0x80), 1009),
-    (frame(b"{", 0x01) + frame(b"", 0x00) * 1025, 1009),  # too many fragments
+    (frame(b"{", 0x01) + frame(b"", 0x00) * 1024 + frame(b"", 0x80), 1009),  # too many fragments
 )
 
 
@@ -411,13 +412,13 @@ def test_a_slow_graph_is_awaited(storage: Storage) -> None:
 
 def test_a_revoked_key_ends_an_idle_stream(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reason of a close frame is limited to 123 bytes, and the name of a key to 100."""
-    monkeypatch.setattr("serve_app.routes.stream.KEY_CHECK_INTERVAL", 0.1)
+    monkeypatch.setattr(stream, "KEY_CHECK_INTERVAL", 0.05)
     tokens = {name: registry.keys.create(name, ["act"])[1] for name in ("bot", "b" * 100)}
     with listening(registry.storage) as listener:
         for name, token in tokens.items():
-            with open_stream(listener, additional_headers={"x-api-key": token}) as stream:
+            with open_stream(listener, additional_headers={"x-api-key": token}) as connection:
                 registry.keys.revoke(name)
-                code, reason = close_of(stream)
+                code, reason = close_of(connection)
                 assert (code, f"{name} was" in reason) == (1008, True)
             until(lambda: listener.server.stream.connections.open == 0)
 
@@ -490,7 +491,7 @@ def closing(connection: ClientConnection) -> tuple[int, dict[str, Any]]:
 def test_open_streams_reconnect_when_the_number_of_replicas_has_changed(
     registry: Registry, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
-    monkeypatch.setattr(stream, "AFTER_CHANGE", ClosingTimes(0.0, 0.1))
+    monkeypatch.setattr(stream, "AFTER_CHANGE", ClosingTimes(0.0, 0.0))
     if change != "added":
         registry.replicas.register("replica-2", {})
     with (
@@ -513,7 +514,7 @@ def test_open_streams_reconnect_when_the_number_of_replicas_has_changed(
 
 def test_streams_stay_open_when_a_drained_replica_ends(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     """They reconnected when it began to drain."""
-    monkeypatch.setattr(stream, "AFTER_CHANGE", ClosingTimes(0.0, 0.1))
+    monkeypatch.setattr(stream, "AFTER_CHANGE", ClosingTimes(0.0, 0.0))
     registry.replicas.register("replica-2", {}, is_draining=True)
     with listening(registry.storage) as listener, open_stream(listener, "memory") as connection:
         assert [answer_to(connection, ONE)["action"] for _ in range(2)] == [0, 0]
@@ -529,7 +530,8 @@ def test_streams_of_a_replica_that_stops_are_closed_earlier(
     registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stream, "AFTER_CHANGE", ClosingTimes(300.0, 400.0))
-    monkeypatch.setattr(stream, "WHILE_DRAINING", ClosingTimes(0.0, 0.1))
+    monkeypatch.setattr(stream, "WHILE_DRAINING", ClosingTimes(0.0, 0.0))
+    monkeypatch.setattr(stream, "KEY_CHECK_INTERVAL", 0.05)
     with listening(registry.storage) as listener, open_stream(listener, "memory") as connection:
         registry.replicas.register("replica-2", {})
         answer_to(connection, ONE)

@@ -60,6 +60,14 @@ def rejected(client: TestClient, body: Any, status: int = 400, model: str = "boa
     return error
 
 
+def change(client: TestClient, path: str, key: str, body: Any = None, status: int = 200) -> dict[str, Any]:
+    """The response to a change with an idempotency key."""
+    content = body if isinstance(body, bytes) else json.dumps(body or {}).encode()
+    reply = client.post(path, content=content, headers={"idempotency-key": key})
+    assert reply.status_code == status, reply.text
+    return reply.json()
+
+
 def b64(array: Any, **more: Any) -> dict[str, Any]:
     array = np.asarray(array)
     return {"b64": b64encode(array.astype(array.dtype.newbyteorder("<")).tobytes()).decode()} | more

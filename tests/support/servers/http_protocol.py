@@ -5,17 +5,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
-import uvicorn
 from starlette.types import ASGIApp
 
 from serve_app.runtime.uvicorn_http import HttpProtocol
+from tests.support.servers.prompt_uvicorn import Config, Server
 
 
 @contextmanager
 def serving(application: ASGIApp, loop: str) -> Iterator[tuple[str, int]]:
     """The address of a server in a thread that has ended afterwards. loop: uvicorn's name of the event loop."""
     protocol = partial(HttpProtocol, lambda: None, None)
-    config = uvicorn.Config(
+    config = Config(
         application,
         port=0,
         loop=loop,
@@ -24,7 +24,7 @@ def serving(application: ASGIApp, loop: str) -> Iterator[tuple[str, int]]:
         lifespan="off",
         log_config=None,
     )
-    server = uvicorn.Server(config)
+    server = Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     while not server.started:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import grpc
-import uvicorn
 
 from serve_app.app import Replica
 from serve_app.inference_protocol import grpc_handlers
+from tests.support.servers.prompt_uvicorn import Config, Server
 from tests.support.servers.replicas import READ_ONLY
 
 SETTINGS = READ_ONLY.model_copy(update={"max_body": 512 * 1024})
@@ -37,7 +37,7 @@ class Listening:
         self._server = server
         # A client of asyncio notices only while it is called that the server has closed its idle connection.
         options: dict[str, Any] = {"log_level": "warning", "ws": "none", "timeout_keep_alive": 600}
-        self._http = uvicorn.Server(uvicorn.Config(server.application(), host="127.0.0.1", port=0, **options))
+        self._http = Server(Config(server.application(), host="127.0.0.1", port=0, **options))
         self._is_listening = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()))
         self._grpc_port = 0

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import uvicorn
-
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.app import Replica
@@ -18,6 +16,7 @@ from serve_app.runtime.serve_bypass import ServeBypass
 from serve_app.settings import ServeSettings
 from tests.support.leagues.served_leagues import BOARD, promote, publish, register
 from tests.support.policies.graphs import masked_mlp
+from tests.support.servers.prompt_uvicorn import Config, Server
 from tests.support.servers.replicas import QUICK, UnavailableEvaluation
 from tests.support.waiting import until
 
@@ -28,7 +27,7 @@ class Listening:
 
     url: str
     server: Replica
-    uvicorn: uvicorn.Server
+    uvicorn: Server
 
     def stream(self, model: str, query: str = "") -> str:
         """The URL of a stream."""
@@ -48,8 +47,8 @@ def listening(
     uvicorn_http.install(server.events.end)
     uvicorn_websocket.install(settings.max_body, settings.max_incomplete)
     application = ServeBypass(server.application())
-    config = uvicorn.Config(application, port=port, log_config=None, log_level="critical", access_log=False, **options)
-    runner = uvicorn.Server(config)
+    config = Config(application, port=port, log_config=None, log_level="critical", access_log=False, **options)
+    runner = Server(config)
     thread = threading.Thread(target=runner.run, daemon=True)
     thread.start()
     until(lambda: runner.started or not thread.is_alive())

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from league.registry.storage.tables import ReplicaTable
 from league.settings import Storage
 from serve_app.app import Replica
 from tests.support.leagues.match_results import record
-from tests.support.leagues.served_leagues import build_everything
+from tests.support.leagues.protocol_leagues import every_kind
 from tests.support.servers import postgresql
 from tests.support.servers.replicas import READ_ONLY, UnavailableEvaluation, local_client
 from tests.support.waiting import until
@@ -25,29 +25,34 @@ from tests.support.waiting import until
 POLLING = READ_ONLY.model_copy(update={"poll": 0.1, "poll_slowest": 0.1})
 
 
-@dataclass(frozen=True)
+@dataclass
 class ReplicasOfBoth:
     """The replicas, and a client of each with a key for all scopes."""
 
-    servers: list[Replica]
-    clients: list[TestClient]
+    servers: list[Replica] = field(default_factory=list)
+    clients: list[TestClient] = field(default_factory=list)
+    _has_changed: bool = False
 
-    def outline(self, method: str, url: str, content: bytes | None, headers: Mapping[str, str]) -> list[Any]:
-        """Send a request to each replica, when all follow the changes of earlier requests and have reported how many
-        they answered; returns status, error code (in the Open Inference Protocol the message), and the keys and types
-        of the document, of each."""
-        for server, client in zip(self.servers, self.clients, strict=True):
+    def responses(
+        self, method: str, url: str, content: bytes | None, headers: Mapping[str, str]
+    ) -> list[httpx.Response]:
+        """Send a request to each replica, when all follow the change of an earlier request and have reported how many
+        they answered.
+        """
+        for server, client in zip(self.servers, self.clients, strict=True) if self._has_changed else ():
             until(partial(_is_settled, server))
             assert client.portal is not None
             client.portal.call(server.reporter.report)
-        return [_outline(client.request(method, url, content=content, headers=headers)) for client in self.clients]
+        responses = [client.request(method, url, content=content, headers=headers) for client in self.clients]
+        self._has_changed = method != "GET" and not all(response.is_error for response in responses)
+        return responses
 
 
 @contextmanager
 def replicas_of_both(directory: Path, socket: Path) -> Iterator[ReplicasOfBoth]:
     """Run the replicas. socket: directory of PostgreSQL's socket."""
     with ExitStack() as stack:
-        replicas = ReplicasOfBoth([], [])
+        replicas = ReplicasOfBoth()
         for database in ("sqlite", "postgresql"):
             storage = Storage.at(directory / database)
             if database == "postgresql":
@@ -76,7 +81,8 @@ def _is_settled(server: Replica) -> bool:
     return has_read and not server.alias_slots.differing() and not server.traffic.differing()
 
 
-def _outline(response: httpx.Response) -> tuple[int, str | None, Any]:
+def outline(response: httpx.Response) -> tuple[int, str | None, Any]:
+    """Status, error code (in the Open Inference Protocol the message), and the keys and types of the document."""
     document = response.json() if "json" in response.headers.get("content-type", "") else None
     is_error = response.status_code >= 400 and isinstance(document, dict)
     code = document.get("code", document.get("error")) if is_error else None
@@ -94,7 +100,7 @@ def _types(document: Any) -> Any:
 
 
 def _fill(storage: Storage) -> str:
-    registry = build_everything(storage)
+    registry = every_kind(storage)
     record(registry)
     _, token = registry.keys.create("databases", SCOPES)
     registry.close()
