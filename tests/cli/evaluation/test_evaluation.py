@@ -187,7 +187,10 @@ def test_games_with_it_are_rendered(league: League, registry: Registry, other: O
     assert other.version(STRONG) in recorded.out
 
 
-def test_an_evaluation_ends_if_the_server_is_gone(league: League, registry: Registry) -> None:
+def test_an_evaluation_ends_if_the_server_is_gone(
+    league: League, registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("league.policies.open_inference.RETRY_DEADLINE", 0.0)
     result = league(*EVALUATE, "tictactoe@1", "http://127.0.0.1:9/v2/models/tictactoe")
     assert (result.code, result.err.count("\n")) == (1, 1)
     assert "http://127.0.0.1:9/v2/models/tictactoe cannot be reached" in result.err
@@ -303,8 +306,10 @@ def test_the_summary_of_a_night_names_the_version_that_training_started_from() -
     """The champion, version 3, was imported or is a mixture."""
     for start, text in ((2, "from tictactoe@2"), (None, "from scratch")):
         steps = {"train": {"versions": ["tictactoe@4"], "start": start}, "measure": {"exploitability": None}}
-        now = datetime.now(UTC)
-        night = TrainingNightRow(id=9, number=5, league="tictactoe", parent=3, steps=steps, began_at=now, ended_at=now)
+        date = datetime.now(UTC)
+        night = TrainingNightRow(
+            id=9, number=5, league="tictactoe", parent=3, steps=steps, began_at=date, ended_at=date
+        )
         assert summary_of_night(night) == [f"tictactoe: night 5 trained tictactoe@4 {text}."]
         assert [night_document(night)[name] for name in ("night", "number", "parent")] == [9, 5, start]
 

@@ -145,14 +145,14 @@ def test_monitoring_chunks_equals_deciding_all_matches(scores: list[float], size
     """For any chunks, the monitor stops in the chunk with the stopping block."""
     matches = matches_with(*((min(1.0, 2 * s), max(0.0, 2 * s - 1)) for s in scores))
     expected = decide_matches(SequentialTest(GATE, "league@2"), matches)
-    monitor, seen = SequentialMonitor(SequentialTest(GATE, "league@2")), 0
+    monitor, number = SequentialMonitor(SequentialTest(GATE, "league@2")), 0
     over = monitor.is_over([])
     assert not over
-    while not over and seen < len(matches):
-        seen += sizes[seen % len(sizes)]
-        over = monitor.is_over(matches[:seen])
+    while not over and number < len(matches):
+        number += sizes[number % len(sizes)]
+        over = monitor.is_over(matches[:number])
     assert over == (expected.outcome is not None)
-    assert close(decide_matches(SequentialTest(GATE, "league@2"), matches[:seen]), expected)
+    assert close(decide_matches(SequentialTest(GATE, "league@2"), matches[:number]), expected)
 
 
 def test_the_challenger_can_be_either_contestant_and_repeated_games_count_once() -> None:
@@ -228,8 +228,8 @@ def test_the_paired_test_keeps_its_error_probabilities(improvement: float) -> No
         rng, wrong, limit = np.random.default_rng(5), 0, 0.05
         for _ in range(500):
             opening = rng.uniform(0.3, 0.7, size=(300, 1))
-            own, other = (rng.binomial(4, np.clip(opening + shift, 0, 1))[:, 0] / 4 for shift in (gap, 0.0))
-            outcome = decide(settings, ((1 + own - other) / 2).tolist(), comparisons=4).outcome
+            candidate, champion = (rng.binomial(4, np.clip(opening + shift, 0, 1))[:, 0] / 4 for shift in (gap, 0.0))
+            outcome = decide(settings, ((1 + candidate - champion) / 2).tolist(), comparisons=4).outcome
             wrong += outcome == wrong_outcome
         assert wrong / 500 <= limit + 2 * (limit * (1 - limit) / 500) ** 0.5
 

@@ -391,7 +391,7 @@ def test_each_verdict_trains_new_exploiters_of_both(tmp_path: Path) -> None:
     seeds = [run.seed for run in runs]
     assert seeds == [seeds[0], seeds[1]] * 2 + [seeds[4], seeds[5]] * 2, "equal for candidate and champion"
     assert len(set(seeds)) == 4
-    of_champion = {each.ref for each in report.exploitability.champion.exploiters}
+    of_champion = {exploiter.ref for exploiter in report.exploitability.champion.exploiters}
     assert of_champion.isdisjoint({"tictactoe@3", "tictactoe@4"})
 
 
@@ -432,8 +432,8 @@ def test_only_complete_runs_with_the_same_settings_count(tmp_path: Path) -> None
         registry.runs.begin(LEAGUE, run, algorithm="ppo", settings=settings, seed=0, target=100)
         tictactoe.publish(registry, STRONGEST, exploits="tictactoe@1", source=f"{run}/100", settings=settings)
         registry.runs.end(LEAGUE, run, "stopped" if run == "stopped" else "ended")
-    found = trained_exploiters(registry, registry.leagues.get(LEAGUE), "tictactoe@1", of_exploiter)
-    assert found == ["tictactoe@7"]
+    exploiters = trained_exploiters(registry, registry.leagues.get(LEAGUE), "tictactoe@1", of_exploiter)
+    assert exploiters == ["tictactoe@7"]
 
 
 @pytest.mark.parametrize(

@@ -228,8 +228,8 @@ def test_the_newest_exploiter_of_each_recent_champion_takes_part(exploited: Regi
 
 def test_pairs_have_common_seeds_and_seats(exploited: Registry) -> None:
     league = exploited.leagues.get(LEAGUE)
-    own = verdict(league.config, league.interface, "tictactoe@6", "tictactoe@2")
-    schedule = paired_test(league.config, league.interface, "exploiter", own, [("tictactoe@5", "tictactoe@5")], 10)
+    test = verdict(league.config, league.interface, "tictactoe@6", "tictactoe@2")
+    schedule = paired_test(league.config, league.interface, "exploiter", test, [("tictactoe@5", "tictactoe@5")], 10)
     assert [schedule.contestants_at(position)[0] for position in range(4)] == ["tictactoe@6", "tictactoe@2"] * 2
     seeds = schedule.seeds_at(range(20))
     assert seeds == [schedule.seed_at(position) for position in range(20)]
@@ -271,7 +271,7 @@ def test_returns_are_compared_if_the_gate_tests_them(tmp_path: Path) -> None:
     assert (test.outcome, test.margin) == ("not worse", 0.5), report
     matches = Ledger(registry).matches(league=LEAGUE, schedule=test.schedule)[: 2 * test.blocks]
     gains = [match.mean_return(0) - match.mean_return(1) for match in matches]
-    gaps = [own - other for own, other in zip(gains[::2], gains[1::2], strict=True)]
+    gaps = [candidate - champion for candidate, champion in zip(gains[::2], gains[1::2], strict=True)]
     assert any(gaps)
     assert test.difference.mean == pytest.approx(np.mean(gaps))
     verify(report.verdict, registry=registry)

@@ -144,7 +144,7 @@ def test_openings_and_scripts_draw_from_the_generators_of_their_game() -> None:
         for index, game in enumerate(match.games):
             squares = list(range(9))
             openings = [generator(match.seed, "opening", 0, agent) for agent in (0, 1)]
-            assert game.opening == tuple(squares.pop(int(len(squares) * each.random())) for each in openings)
+            assert game.opening == tuple(squares.pop(int(len(squares) * draw.random())) for draw in openings)
             agent = game.sides.index(0)
             script = generator(match.seed, "policy", index, agent)
             for ply, action in enumerate(game.actions):
@@ -512,7 +512,7 @@ def test_a_draw_depends_on_the_game_only(share: float, seed: int, position: int)
     mixtures = {MIXTURE: mixture(share)}
     positions = [position, position + 7, position + 20]
     together = acting_versions(schedule, game_plans(schedule, positions), mixtures)
-    alone = [acting_versions(schedule, game_plans(schedule, [each]), mixtures).members for each in positions]
+    alone = [acting_versions(schedule, game_plans(schedule, [one]), mixtures).members for one in positions]
     assert together.members == tuple(members for two in alone for members in two)
     for plan, members in zip(game_plans(schedule, positions).contestants, together.members, strict=True):
         assert [member is not None for member in members] == [index == 0 for index in plan] or members == ()
@@ -521,9 +521,9 @@ def test_a_draw_depends_on_the_game_only(share: float, seed: int, position: int)
 def test_members_play_their_shares() -> None:
     schedule = round_robin(tictactoe.config(), INTERFACE, [MIXTURE, "script:random"], 1000)
     drawn = acting_versions(schedule, game_plans(schedule, range(1000)), {MIXTURE: mixture(0.3)})
-    found = Counter(members[0] for members in drawn.members)
-    assert 500 < found[1] < 700
-    assert found[1] + found[2] == 2000
+    games = Counter(members[0] for members in drawn.members)
+    assert 500 < games[1] < 700
+    assert games[1] + games[2] == 2000
 
 
 def test_the_member_plays_as_it_does_alone() -> None:

@@ -188,16 +188,16 @@ def test_chunks_are_stored_in_order(registry: Registry, tmp_path: Path, monkeypa
         return "node", matches
 
     monkeypatch.setattr(tournament, "_play_chunk", delay_first_chunk)
-    seen: list[list[int]] = []
+    calls: list[list[int]] = []
 
     def has_second_chunk(matches: list[Match]) -> bool:
-        seen.append([match.position for match in matches])
+        calls.append([match.position for match in matches])
         return False
 
     assert play_schedule(schedule, registry=registry, workers=2, enough=has_second_chunk) == play_locally(
         registry, schedule
     )
-    assert all(positions == list(range(len(positions))) for positions in seen)
+    assert all(positions == list(range(len(positions))) for positions in calls)
 
 
 @pytest.mark.usefixtures("ray_session")
@@ -207,13 +207,13 @@ def test_a_killed_worker_is_replaced(registry: Registry, tmp_path: Path, monkeyp
     @ray.remote(num_cpus=1, max_retries=tournament.RETRIES)
     def play_or_die(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range) -> tuple[str, list[Match]]:
         schedule, storage, config, _ = job
-        here = match_worker(storage, config)
+        worker = match_worker(storage, config)
         for position in chunk:
             if chunk.start == 4 and position == 6 and not died.exists():
                 died.touch()
                 os.kill(os.getpid(), signal.SIGKILL)
-            here.play(schedule, [position])
-        return "node", here.play(schedule, chunk)
+            worker.play(schedule, [position])
+        return "node", worker.play(schedule, chunk)
 
     monkeypatch.setattr(tournament, "_play_chunk", play_or_die)
     assert play_schedule(schedule, registry=registry, workers=2) == play_locally(registry, schedule)
@@ -418,8 +418,8 @@ def test_cross_play_mixes_versions_in_a_team(team: Registry) -> None:
     for cell in (cell for row in table.returns for cell in row):
         assert cell.low < cell.value < (cell.high or 0) < 0
     games = [match.games[0] for match in matches if match.contestants == mixed]
-    seat, others = zip(*(game.returns for game in games), strict=True)
-    assert table.returns[0][1].value == pytest.approx((np.mean(seat) + 2 * np.mean(others)) / 3)
+    seat, teammates = zip(*(game.returns for game in games), strict=True)
+    assert table.returns[0][1].value == pytest.approx((np.mean(seat) + 2 * np.mean(teammates)) / 3)
     assert compute_leaderboard(team, "spread") == (), "team games have no leaderboard"
     first, second = next(match for match in matches if match.contestants == mixed).games
     assert first.actions != second.actions, "teammates affect the game"
@@ -540,9 +540,9 @@ def league(home: Path, settings: LeagueConfig, *actions: int) -> Registry:
     registry.leagues.register(settings, interface(settings))
     spaces = registry.leagues.get("fuse").interface.of_policy("shared")
     for action in actions:
-        chosen = np.zeros((2, ACTIONS))
-        chosen[:, action] = 1
-        tictactoe.publish(registry, tictactoe.linear(spaces, chosen=chosen), "fuse")
+        weights = np.zeros((2, ACTIONS))
+        weights[:, action] = 1
+        tictactoe.publish(registry, tictactoe.linear(spaces, chosen=weights), "fuse")
     return registry
 
 

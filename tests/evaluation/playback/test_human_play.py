@@ -157,14 +157,20 @@ def next_action_graph(width: int, actions: int) -> bytes:
         helper.make_node("Add", ["taken", "one"], ["state_out_action"]),
     ]
     weights = {"count": [[actions]], "all": [list(range(actions))], "one": [[1]]}
-    taken, given = {"observation": width, "state_in_action": 1}, {"action_dist_inputs": actions, "state_out_action": 1}
+    sizes, output_sizes = (
+        {"observation": width, "state_in_action": 1},
+        {"action_dist_inputs": actions, "state_out_action": 1},
+    )
     graph = helper.make_graph(
         nodes,
         "following",
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in taken.items()],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in sizes.items()],
         [
             helper.make_tensor_value_info("action", TensorProto.INT64, ["batch"]),
-            *(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size]) for name, size in given.items()),
+            *(
+                helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
+                for name, size in output_sizes.items()
+            ),
         ],
         [numpy_helper.from_array(np.array(value, np.float32), name) for name, value in weights.items()],
     )

@@ -420,8 +420,8 @@ def test_a_game_is_played_step_by_step(entry_point: str, simultaneous: bool) -> 
     assert sorted(ending.agent for ending in steps[-1].endings) == list(range(len(league_interface.agents)))
     again = list(play_game(stock_stepping(config.environment, 1), players, seed=3))
     other = list(play_game(stock_stepping(config.environment, 1), players, seed=4))
-    taken = [[[move.action for move in step.moves] for step in each] for each in (steps, again, other)]
-    assert taken[0] == taken[1] != taken[2]
+    actions = [[[move.action for move in step.moves] for step in game] for game in (steps, again, other)]
+    assert actions[0] == actions[1] != actions[2]
     assert steps[-1].returns == again[-1].returns
 
 

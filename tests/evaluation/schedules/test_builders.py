@@ -113,8 +113,8 @@ def test_each_contestant_plays_each_side_once_with_one_seed(positions: list[int]
     assert plans.indices.tolist() == [0, 1] * len(positions)
     assert plans.sides.tolist() == [[0, 1], [1, 0]] * len(positions)
     assert plans.seeds.tolist() == [SCHEDULE.seed_at(position) for position in plans.positions.tolist()]
-    for position, own in zip(plans.positions.tolist(), plans.contestants.tolist(), strict=True):
-        assert tuple(SCHEDULE.contestants[index] for index in own) == SCHEDULE.contestants_at(position)
+    for position, contestants in zip(plans.positions.tolist(), plans.contestants.tolist(), strict=True):
+        assert tuple(SCHEDULE.contestants[index] for index in contestants) == SCHEDULE.contestants_at(position)
 
 
 @given(st.integers(1, 7), positions)
@@ -199,8 +199,8 @@ STEP = 50 * np.log(10) / 400
 def table(points: dict[tuple[int, int], tuple[float, float]], size: int) -> tuple[np.ndarray, np.ndarray]:
     """pair → score of the first contestant, games"""
     scored, games = np.zeros((2, size, size))
-    for (i, j), (own, played) in points.items():
-        scored[i, j], scored[j, i] = own, played - own
+    for (i, j), (score, played) in points.items():
+        scored[i, j], scored[j, i] = score, played - score
         games[i, j] = games[j, i] = played
     return scored, games
 
@@ -245,7 +245,7 @@ def test_the_numbering_of_contestants_does_not_matter() -> None:
     order = np.array([3, 0, 4, 2, 1])
     ((i, j),) = choose(scored, games, 1)
     renamed = choose(scored[np.ix_(order, order)], games[np.ix_(order, order)], 1)
-    assert {int(order[each]) for each in renamed[0]} == {i, j}
+    assert {int(order[number]) for number in renamed[0]} == {i, j}
 
 
 def test_results_are_added_for_both_contestants_and_rounds_grow() -> None:

@@ -19,6 +19,7 @@ from PIL import Image
 
 from evaluation.matches.tournament import evaluate
 from evaluation.service import game_worker_pool
+from evaluation.service.game_worker import GameWorker
 from evaluation.service.game_worker_pool import GameWorkerPool
 from league import subprocesses
 from league.environments.building import interface
@@ -240,28 +241,28 @@ def test_a_process_that_dies_is_reported_and_replaced(pool: GameWorkerPool, monk
     assert document_of(submit(pool, play_request(opponent="script:random"), "dying"))["legal"]
 
 
-def test_an_exception_of_the_environment_is_reported_and_the_next_game_is_independent(pool: GameWorkerPool) -> None:
+def test_an_exception_of_the_environment_is_reported_and_the_next_game_is_independent(registry: Registry) -> None:
+    worker = GameWorker("raising", registry)
     for _ in range(2):
         with pytest.raises(GameCrashed, match="the board is gone"):
-            submit(pool, play_request(0, opponent="script:random"), "raising")
-    assert document_of(submit(pool, play_request(opponent="script:random"), "raising"))["legal"] == list(range(9))
+            worker.respond(play_request(0, opponent="script:random"))
+    assert document_of(worker.respond(play_request(opponent="script:random")))["legal"] == list(range(9))
 
 
-def test_a_changed_environment_is_used_for_the_next_game(pool: GameWorkerPool, registry: Registry) -> None:
+def test_a_changed_environment_is_used_for_the_next_game(registry: Registry) -> None:
     """Also after one that cannot be created, which is a server error."""
+    worker = GameWorker("moving", registry)
 
-    def play(conditions: str, entry_point: str) -> GameResponse:
+    def play(entry_point: str) -> GameResponse:
         config = tictactoe.config(league="moving", environment={"entry_point": entry_point})
         registry.leagues.register(config, registry.leagues.get(LEAGUE).interface)
-        operation = play_request(0, opponent="script:first")
-        request = GameRequest(league="moving", conditions=conditions, operation=operation)
-        return asyncio.run(pool.submit(request, LONG))
+        return worker.respond(play_request(0, opponent="script:first"))
 
     with pytest.raises(GameCrashed, match=r"the environment of moving cannot be created: .*games\.none"):
-        play("1-greedy", "games.none:none")
-    assert len(document_of(play("2-greedy", "pettingzoo.classic.tictactoe_v3"))["steps"]) == 3
+        play("games.none:none")
+    assert len(document_of(play("pettingzoo.classic.tictactoe_v3"))["steps"]) == 3
     with pytest.raises(GameCrashed, match="the board is gone"):
-        play("3-greedy", "tests.support.environments.hanging:Raising")
+        play("tests.support.environments.hanging:Raising")
 
 
 def test_idle_leagues_are_evicted_but_not_during_a_game(registry: Registry) -> None:
@@ -296,13 +297,14 @@ def test_few_requests_may_wait(pool: GameWorkerPool, pause: threading.Event, mon
     asyncio.run(submit_many())
 
 
-def test_only_leagues_with_discrete_actions_are_playable(registry: Registry, pool: GameWorkerPool) -> None:
+def test_only_leagues_with_discrete_actions_are_playable(registry: Registry) -> None:
     kwargs = {"max_cycles": 4, "continuous_actions": True}
     environment = {"entry_point": "mpe2.simple_spread_v3", "kwargs": kwargs}
     config = tictactoe.config(league="spread", environment=environment, play={"opening_plies": 0})
     registry.leagues.register(config, interface(config))
-    document = document_of(submit(pool, PlayabilityRequest(), "spread"))
+    worker = GameWorker("spread", registry)
+    document = document_of(worker.respond(PlayabilityRequest()))
     assert (document["playable"], document["agents"]) == (False, [])
     assert document["why"] == "human play needs Discrete actions, but its agents have Box"
     with pytest.raises(EnvironmentMismatch, match="agent_0 has Box"):
-        submit(pool, play_request(opponent="script:random", agent="agent_0"), "spread")
+        worker.respond(play_request(opponent="script:random", agent="agent_0"))

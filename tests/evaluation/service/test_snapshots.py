@@ -176,10 +176,10 @@ def test_a_league_without_matches_has_all_parts(tmp_path: Path) -> None:
 
 def test_different_sides_have_their_own_standings(tmp_path: Path) -> None:
     with reported_league.league_with_roles(tmp_path) as registry:
-        found = documents(registry, LEAGUE)
-    assert found["summary"]["scoring"] == "side"
-    assert list(found["leaderboard"]["by_side"]) == ["adversary", "good"]
-    assert {standing["games"] for standing in found["leaderboard"]["by_side"]["good"]} == {10}
+        content = documents(registry, LEAGUE)
+    assert content["summary"]["scoring"] == "side"
+    assert list(content["leaderboard"]["by_side"]) == ["adversary", "good"]
+    assert {standing["games"] for standing in content["leaderboard"]["by_side"]["good"]} == {10}
 
 
 def test_the_longest_waiting_leagues_are_refreshed_first(registry: Registry) -> None:

@@ -111,8 +111,8 @@ def test_alpha_rank_is_stationary_and_favours_undefeated_strategies(payoff: np.n
     assert (rank >= 0).all()
     assert rank.sum() == pytest.approx(1)
     for one in range(len(payoff)):
-        others = np.delete(payoff[one], one)
-        if len(others) and (others >= 0.25).all():
+        scores = np.delete(payoff[one], one)
+        if len(scores) and (scores >= 0.25).all():
             assert rank[one] == pytest.approx(1, abs=1e-3)
 
 
@@ -175,17 +175,17 @@ def test_differences_are_paired_by_block(alone: bool) -> None:
     """Contestant 0 gets a gap more, on seeds of different values. One block has no interval."""
     matches = []
     for position, gap in enumerate(GAPS):
-        own, other = position + gap, float(position)
-        games = tuple(Game((i, 1 - i), 1, (), (), (own, other), (1.0, 0.0)) for i in range(2))
+        score, opponent_score = position + gap, float(position)
+        games = tuple(Game((i, 1 - i), 1, (), (), (score, opponent_score), (1.0, 0.0)) for i in range(2))
         if alone:
-            first = Game((0,), 1, (), (), (own, None), (1.0, None))
-            games = (first, Game((1,), 1, (), (), (None, other), (None, 0.0)))
+            first = Game((0,), 1, (), (), (score, None), (1.0, None))
+            games = (first, Game((1,), 1, (), (), (None, opponent_score), (None, 0.0)))
         matches.append(Match(f"s/{position}", "league", "s", position, ("a", "b"), 1, "digest", games))
     interval = ttest_1samp(GAPS, 0).confidence_interval()
     gap = paired_difference(matches, "a")
     assert (gap.mean, gap.low, gap.high) == pytest.approx((np.mean(GAPS), interval.low, interval.high))
-    other = paired_difference(matches, "b")
-    assert (other.mean, other.low, other.high) == pytest.approx((-gap.mean, -interval.high, -interval.low))
+    reverse = paired_difference(matches, "b")
+    assert (reverse.mean, reverse.low, reverse.high) == pytest.approx((-gap.mean, -interval.high, -interval.low))
     assert paired_difference([], "a") is None
     single = student_interval([2.0])
     assert close((single.mean, single.low, single.high), (2.0, None, None))
@@ -284,8 +284,8 @@ def test_the_interval_has_its_coverage() -> None:
     truth = covered = 0
     for seed in range(200):
         scores = rng.normal(size=(40, 5))
-        found = stratified_bootstrap(lambda resample: float(resample.mean()), scores, resamples=300, seed=seed)
-        covered += found.low <= truth <= found.high
+        interval = stratified_bootstrap(lambda resample: float(resample.mean()), scores, resamples=300, seed=seed)
+        covered += interval.low <= truth <= interval.high
     assert 178 <= covered <= 199, "95 % of 200, within 3.5 standard deviations"
 
 
@@ -293,10 +293,10 @@ def test_the_interval_of_few_runs_is_as_wide_as_students() -> None:
     """Unexpanded percentiles of three runs are about a quarter too narrow."""
     runs, tasks = 3, 10
     scores = np.random.default_rng(0).normal(size=(runs, tasks))
-    found = stratified_bootstrap(lambda resample: float(resample.mean()), scores)
+    interval = stratified_bootstrap(lambda resample: float(resample.mean()), scores)
     error = np.sqrt(scores.var(axis=0, ddof=1).sum() / runs) / tasks
     expected = 2 * stdtrit(tasks * (runs - 1), 0.975) * error
-    assert found.high - found.low == pytest.approx(expected, rel=0.1)
+    assert interval.high - interval.low == pytest.approx(expected, rel=0.1)
 
 
 def test_intervals_are_reproducible_and_stratified_by_task() -> None:
@@ -329,13 +329,13 @@ NOW = datetime(2026, 1, 1, tzinfo=UTC)
 @given(st.lists(st.tuples(st.integers(1, 8), st.floats(0, 400)), max_size=900), st.integers(1, 1000))
 def test_no_365_days_spend_more_than_alpha(gaps: list[tuple[int, float]], nights: int) -> None:
     """Runs at any times, with any number of candidates, and a `nights` that may be far too small."""
-    now, verdicts = NOW, []
+    time, verdicts = NOW, []
     for candidates, hours in gaps:
-        now += timedelta(hours=hours)
-        part = alpha_share(candidates, 0.05, nights, alpha_spent(verdicts, now))
+        time += timedelta(hours=hours)
+        part = alpha_share(candidates, 0.05, nights, alpha_spent(verdicts, time))
         assert 0 <= part <= 0.05 / nights / candidates
-        verdicts += [(now, part)] * candidates
-        assert alpha_spent(verdicts, now) <= 0.05 * (1 + 1e-9)
+        verdicts += [(time, part)] * candidates
+        assert alpha_spent(verdicts, time) <= 0.05 * (1 + 1e-9)
 
 
 def test_alpha_spent_more_than_a_year_ago_is_ignored() -> None:
