@@ -94,8 +94,8 @@ def closed_databases() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(Database, "__init__", record)
         yield
-    for each in opened:
-        each.close()
+    for connection_pool in opened:
+        connection_pool.close()
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -46,8 +46,8 @@ OPERATIONS, MONITORING, SETTINGS = (
 
 def exports() -> dict[str, str]:
     """The environment variables in the comments of deploy.yaml."""
-    found = re.findall(r"^#\s+export (\w+)=(\"[^\"]*\"|\S+)", (ROOT / "deploy.yaml").read_text(), flags=re.M)
-    return {name: value.strip('"') for name, value in found}
+    lines = re.findall(r"^#\s+export (\w+)=(\"[^\"]*\"|\S+)", (ROOT / "deploy.yaml").read_text(), flags=re.M)
+    return {name: value.strip('"') for name, value in lines}
 
 
 def test_the_cluster_serves_like_a_single_machine() -> None:
@@ -132,8 +132,8 @@ def schema_of(kind: str) -> Any:
 def faults(document: Any) -> list[str]:
     """Where a Kubernetes object differs from the schema of its kind. Unknown fields are faults."""
     schema = schema_of(document["kind"]) | {"$defs": KUBERNETES["$defs"]}
-    found = jsonschema.Draft202012Validator(schema).iter_errors(document)
-    return [f"{error.json_path}: {error.message}" for error in found]
+    errors = jsonschema.Draft202012Validator(schema).iter_errors(document)
+    return [f"{error.json_path}: {error.message}" for error in errors]
 
 
 def test_kubernetes_accepts_the_objects_and_no_unknown_field() -> None:
@@ -235,14 +235,14 @@ def queries() -> list[tuple[str, str]]:
 
 def samples() -> dict[str, tuple[str, ...]]:
     """Name of each sample in the exposition → its labels."""
-    found: dict[str, tuple[str, ...]] = {}
+    labels_of_samples: dict[str, tuple[str, ...]] = {}
     for name, metric in METRICS.items():
         labels = (*metric.labels, "replica")
         if metric.kind == "histogram":
-            found |= {f"{name}_bucket": (*labels, "le"), f"{name}_sum": labels, f"{name}_count": labels}
+            labels_of_samples |= {f"{name}_bucket": (*labels, "le"), f"{name}_sum": labels, f"{name}_count": labels}
         else:
-            found[name] = labels
-    return found
+            labels_of_samples[name] = labels
+    return labels_of_samples
 
 
 def test_queries_use_existing_metrics_and_labels_and_each_metric_is_used() -> None:
@@ -365,8 +365,8 @@ def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
 
     for job, if_busy in zip(JOBS, ("Ignore", "Count"), strict=True):
         rules = [r for r in job["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]
-        found = {tuple(rule["onExitCodes"]["values"]): rule["action"] for rule in rules}
-        assert found == {(FAULTS, 2): "FailJob", (BUSY,): if_busy}
+        actions = {tuple(rule["onExitCodes"]["values"]): rule["action"] for rule in rules}
+        assert actions == {(FAULTS, 2): "FailJob", (BUSY,): if_busy}
     crontab = (ROOT / "deploy/nightly/crontab").read_text()
     for unit, command in ("league-nightly", NIGHTLY), ("league-training-night", TRAINING_NIGHT):
         service, timer = ((ROOT / f"deploy/nightly/{unit}.{kind}").read_text() for kind in ("service", "timer"))

@@ -19,9 +19,9 @@ def test_the_code_of_the_tutorial_runs(capsys: pytest.CaptureFixture[str]) -> No
         if "".join(block.split()) not in example:
             exec(compile(block, "vectorised-environments.md", "exec"), names)
     printed = capsys.readouterr().out
-    shown = re.findall(r"^```text\n(.*?)^```", text, flags=re.S | re.M)
-    assert shown
-    assert [text for text in shown if text not in printed] == []
+    outputs = re.findall(r"^```text\n(.*?)^```", text, flags=re.S | re.M)
+    assert outputs
+    assert [text for text in outputs if text not in printed] == []
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ def small_settings(path: Path) -> dict[str, int]:
 def test_module_graph_and_endpoint_act_identically(name: str, served: Served) -> None:
     registry, url, versions = served
     compared = compare(versions[name], registry, url, OBSERVATIONS)
-    assert {each.policy for each in compared} == set(versions[name].manifest.policies)
-    for each in compared:
-        assert each.observations == OBSERVATIONS
-        assert each.equal, each
+    assert {parity.policy for parity in compared} == set(versions[name].manifest.policies)
+    for parity in compared:
+        assert parity.observations == OBSERVATIONS
+        assert parity.equal, parity

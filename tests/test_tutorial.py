@@ -122,6 +122,6 @@ def test_the_calls_in_all_languages_are_the_same() -> None:
         assert "http://127.0.0.1:8000" in program
     for program in programs[1:]:
         assert "/v1/policies/nim/action" in program
-        numbers = [json.loads(f"[{found}]") for found in re.findall(r"[\[{] ?((?:[01], )+[01]) ?[\]}]", program)]
+        numbers = [json.loads(f"[{items}]") for items in re.findall(r"[\[{] ?((?:[01], )+[01]) ?[\]}]", program)]
         assert numbers == [stones, [1, 1, 1]]
         assert all(name in program for name in ("observation", "action_mask"))

@@ -16,7 +16,7 @@ PACKAGES = (
     "policy_league",
     "scripts",
     "serve_app",
-    "tests/support",
+    "tests",
     "training",
 )
 GENERATED = ("_pb2.py", "_sync", "migrations")

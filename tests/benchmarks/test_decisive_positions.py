@@ -55,17 +55,18 @@ def test_hands_equal_those_of_the_environment() -> None:
         while True:
             agent = env.agent_selection
             player = roles.setdefault(agent, 1)
-            seen, *_ = env.last()
-            rank = ranks.setdefault(player, int(seen["observation"][:RANKS].argmax()))
+            observation, *_ = env.last()
+            rank = ranks.setdefault(player, int(observation["observation"][:RANKS].argmax()))
             if hand.awaits_card:
                 hand = Hand(
-                    **{f: getattr(hand, f) for f in Hand.__slots__} | {"public": int(seen["observation"][3:6].argmax())}
+                    **{f: getattr(hand, f) for f in Hand.__slots__}
+                    | {"public": int(observation["observation"][3:6].argmax())}
                 )
             assert hand.turn == player
-            np.testing.assert_array_equal(hand.observation(rank), seen["observation"][:STOCK_SIZE])
-            np.testing.assert_array_equal(hand.information_state(rank), seen["observation"])
-            np.testing.assert_array_equal(hand.legal(), seen["action_mask"])
-            action = int(rng.choice(np.flatnonzero(seen["action_mask"])))
+            np.testing.assert_array_equal(hand.observation(rank), observation["observation"][:STOCK_SIZE])
+            np.testing.assert_array_equal(hand.information_state(rank), observation["observation"])
+            np.testing.assert_array_equal(hand.legal(), observation["action_mask"])
+            action = int(rng.choice(np.flatnonzero(observation["action_mask"])))
             hand = hand.after(action)
             env.step(action)
             if hand.is_over:

@@ -111,9 +111,9 @@ def test_exploiters_and_retired_versions_cannot_be_promoted(tab: Tab) -> None:
 
     def change(route: Route) -> None:
         reply = route.fetch()
-        found = reply.json()
-        versions = [version | changes.get(version["version"], {}) for version in found["versions"]]
-        route.fulfill(response=reply, json=found | {"versions": versions})
+        document = reply.json()
+        versions = [version | changes.get(version["version"], {}) for version in document["versions"]]
+        route.fulfill(response=reply, json=document | {"versions": versions})
 
     tab.page.route(re.compile(rf"/v1{L}/versions(\?|$)"), change)
     page = tab.open(f"{L}/versions")
@@ -296,7 +296,7 @@ def test_a_page_recovers_with_the_server_without_user_action(tab: Tab) -> None:
     tab.page.unroute("**/v1/**/leaderboard*")
     expect_champion(page, 3)
     expect(page.get_by_role("alert")).to_have_count(0)
-    tab.errors = [each for each in tab.errors if "net::ERR_FAILED" not in each]
+    tab.errors = [error for error in tab.errors if "net::ERR_FAILED" not in error]
 
 
 LIVE_PAGES = ("/", L, f"{L}/runs/{RUN}", f"/leagues/{CONNECT_FOUR}/play")
@@ -326,7 +326,7 @@ def test_each_open_page_says_that_the_server_is_not_responding(tab: Tab, served:
         server.start()
         expect_notices(0)
         expect_champion(pages[1], 2)
-    tab.errors = [each for each in tab.errors if "net::ERR_" not in each]
+    tab.errors = [error for error in tab.errors if "net::ERR_" not in error]
 
 
 def test_an_open_event_stream_does_not_hide_that_requests_fail(tab: Tab) -> None:
@@ -336,7 +336,7 @@ def test_an_open_event_stream_does_not_hide_that_requests_fail(tab: Tab) -> None
     expect(page.get_by_role("banner").get_by_text("The server is not responding")).to_be_visible()
     page.context.set_offline(False)
     expect(page.get_by_role("alert")).to_have_count(0)
-    tab.errors = [each for each in tab.errors if "net::ERR_" not in each]
+    tab.errors = [error for error in tab.errors if "net::ERR_" not in error]
 
 
 def test_an_invalid_key_is_rejected(tab: Tab, served: Served) -> None:

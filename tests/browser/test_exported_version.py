@@ -92,8 +92,8 @@ def test_the_example_acts_as_the_graph_does_in_python(page: Page, exported: Path
     masks = rng.integers(0, 2, (ROWS, 7), dtype=np.int8)
     masks[np.arange(ROWS), rng.integers(0, 7, ROWS)] = 1
     sent = [boards.ravel().tolist(), masks.ravel().tolist()]
-    found = page.evaluate("([boards, masks]) => act(new Int8Array(boards), new Int8Array(masks))", sent)
+    actions = page.evaluate("([boards, masks]) => act(new Int8Array(boards), new Int8Array(masks))", sent)
     expected = OnnxPolicy(exported / "shared.onnx").distribution({"observation": boards, "action_mask": masks})
     assert expected.dist_inputs is not None
-    assert excused(np.array(found), expected.actions, expected.dist_inputs, Discrete(n=7)).all()
-    assert len(set(found)) == 7
+    assert excused(np.array(actions), expected.actions, expected.dist_inputs, Discrete(n=7)).all()
+    assert len(set(actions)) == 7

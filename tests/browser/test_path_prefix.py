@@ -125,6 +125,6 @@ def test_a_proxy_that_leaves_the_prefix_needs_the_root_path(
 def test_clients_call_the_server_below_the_prefix(served: Served, proxied: Proxy) -> None:
     observation = {"observation": np.zeros((3, 3, 2), np.int8), "action_mask": np.ones(9, np.int8)}
     with Client(proxied.url, key=served.keys["everything"]) as client:
-        assert LEAGUE in [each["league"] for each in client.leagues()]
+        assert LEAGUE in [league["league"] for league in client.leagues()]
         with client.stream(LEAGUE) as stream:  # a WebSocket
             assert stream.act(observation) == client.act(LEAGUE, observation).action

@@ -98,14 +98,14 @@ def test_every_link_leads_to_a_page_of_the_report(opened: Open, report: dict[str
     page = opened(report)
     waiting = visited = {""}
     while waiting:
-        address, *others = waiting
+        address, *remaining = waiting
         page.evaluate("hash => { location.hash = hash }", address)
         page.reload()  # the page before would satisfy what follows
         expect_finished(page)
         expect(page.locator("main section")).to_be_visible()
         expect(page.locator("main")).not_to_contain_text(re.compile("does not contain|not found"))
         links = set(page.locator("a:not(.skip-link)").evaluate_all("links => links.map(link => link.hash)"))
-        waiting, visited = {*others, *links - visited}, visited | links
+        waiting, visited = {*remaining, *links - visited}, visited | links
     assert len(visited) > 15
 
 
@@ -183,8 +183,8 @@ def test_further_evidence_of_a_verdict(opened: Open, report: dict[str, Any], exp
     main = page.locator("main")
     expect(main).to_contain_text(re.compile(rf"{re.escape(test.finding)}.*−3\.00", re.S))
     expect(main).to_contain_text("A best response to tictactoe@2 scores at least 40.0 %.")
-    others = "; for others that are trained in the same way: +0.100 0.010 to 0.190"
-    expect(main).to_contain_text(f"The 95 % interval is for these exploiters{others if exploiters > 1 else ''}.")
+    comparison = "; for others that are trained in the same way: +0.100 0.010 to 0.190"
+    expect(main).to_contain_text(f"The 95 % interval is for these exploiters{comparison if exploiters > 1 else ''}.")
     expect(main).to_contain_text("score 54.4 %, +31 Elo, 95 % interval −∞ to +59.")
     expect(main).to_contain_text("0.014 %")
 

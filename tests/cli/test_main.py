@@ -179,9 +179,9 @@ def test_text_of_others_controls_neither_the_terminal_nor_the_direction_of_text(
         monkeypatch.setattr(output, "SECONDS_PER_LINE", 0.0)
         listener(Progress(UNTRUSTED, 1, 2))
         listener(Progress(UNTRUSTED, 2, 2))
-    shown = printed.getvalue()
-    assert shown.count(SHOWN) >= 4
-    assert not output.CONTROL.search(shown)
+    text = printed.getvalue()
+    assert text.count(SHOWN) >= 4
+    assert not output.CONTROL.search(text)
     output.emit({"name": UNTRUSTED})
     written = capsys.readouterr().out
     assert not output.CONTROL.search(written)
@@ -199,8 +199,10 @@ def test_a_board_of_the_demo_is_drawn_with_its_columns() -> None:
 def test_all_checks_of_doctor_pass(league_process: League) -> None:
     result = league_process("doctor", "--json")
     document = result.json
-    found = {check["what"]: check["status"] for check in document["checks"]}
-    assert {"Python", "ray", "torch", "CPU", "GPU", "LEAGUE_HOME", "disk", "registry", "Ray", "HAProxy"} <= set(found)
+    statuses = {check["what"]: check["status"] for check in document["checks"]}
+    assert {"Python", "ray", "torch", "CPU", "GPU", "LEAGUE_HOME", "disk", "registry", "Ray", "HAProxy"} <= set(
+        statuses
+    )
     assert document["ok"], document
     assert result.code == 0
 
@@ -229,12 +231,12 @@ def test_the_ports_are_those_of_the_deployment(league: League, tmp_path: Path, m
     monkeypatch.setattr(doctor, "CHECKS", (doctor._ports,))
     monkeypatch.setattr(launch, "DEPLOY_YAML", deploy := tmp_path / "deploy.yaml")
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_server(("127.0.0.1", 0)) as other:
-        taken, free = (each.getsockname()[1] for each in (server, other))
+        busy, free = (listener.getsockname()[1] for listener in (server, other))
         other.close()
-        deploy.write_text(f"http_options: {{port: {free}}}\ngrpc_options: {{port: {taken}}}\n")
+        deploy.write_text(f"http_options: {{port: {free}}}\ngrpc_options: {{port: {busy}}}\n")
         http, grpc = league("doctor", "--json").json["checks"]
     assert (http["what"], http["status"], http["found"]) == ("serving HTTP", "ok", f"port {free} is free")
-    assert (grpc["what"], grpc["status"], grpc["found"]) == ("serving gRPC", "note", f"port {taken} is in use")
+    assert (grpc["what"], grpc["status"], grpc["found"]) == ("serving gRPC", "note", f"port {busy} is in use")
     assert "--grpc-port PORT" in grpc["advice"]
 
 

@@ -11,10 +11,10 @@ from tests.support.cluster.league_cluster import LeagueCluster
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that all machines share."""
-    found = tmp_path_factory.mktemp("cluster")
-    for path in (found, found.parent):
+    folder = tmp_path_factory.mktemp("cluster")
+    for path in (folder, folder.parent):
         path.chmod(0o755)  # PostgreSQL runs as another user
-    return found
+    return folder
 
 
 @pytest.fixture(scope="module")

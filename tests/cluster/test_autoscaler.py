@@ -25,8 +25,8 @@ def test_training_waits_for_the_nodes_that_it_requests(tmp_path: Path) -> None:
         "COLUMNS": "200",
     }
     config = str(scenarios.write_config(tmp_path, runners=1, steps=2048))
-    with network(["head"], tmp_path) as found:
-        head = found["head"]
+    with network(["head"], tmp_path) as members:
+        head = members["head"]
         autoscaled_head.start(head, tmp_path / "autoscaler.json", environment)
         command = (LEAGUE, "train", config, "--address", f"{head.address}:6379")
         output = head.check_run(*command, environment=environment, timeout=2 * START_TIMEOUT)

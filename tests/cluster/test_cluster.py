@@ -75,7 +75,7 @@ def test_evaluations_over_http_are_played(cluster: LeagueCluster, key: str) -> N
     ended = serving_scenarios.evaluate_over_http(cluster, key, HTTP_BLOCKS)
     assert (ended["state"], ended["error"]) == ("done", None)
     assert {f"{scenarios.LEAGUE}@1", f"{scenarios.LEAGUE}@2"} <= {
-        each["ref"] for each in ended["result"]["leaderboard"]
+        standing["ref"] for standing in ended["result"]["leaderboard"]
     }
 
 

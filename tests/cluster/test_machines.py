@@ -22,8 +22,8 @@ def pair(tmp_path: Path) -> Iterator[tuple[Machine, Machine]]:
     """A server and a client."""
     if (reason := machines.obstacle()) is not None:
         pytest.skip(reason)
-    with network(["server", "client"], tmp_path) as found:
-        yield found["server"], found["client"]
+    with network(["server", "client"], tmp_path) as members:
+        yield members["server"], members["client"]
 
 
 def test_a_machine_is_cut_off_killed_and_started_again(pair: tuple[Machine, Machine]) -> None:

@@ -24,11 +24,11 @@ from league.environments.building import interface
 from league.errors import LeagueError
 from league.registry.registry import Registry
 from league.settings import Storage
+from tests.support.algorithms import running
 from training.algorithms.rllib_config import with_algorithm
 from training.export.publish import Checkpoint, publish
 from training.runs.run_directory import RUN_FILE, RunRecord
 from training.runs.train import check, train
-from training.runs.trial import build_algorithm
 
 PAGE = (Path(__file__).parents[2] / "docs/extending.md").read_text()
 
@@ -56,12 +56,9 @@ def publish_short_training(registry: Registry, config: LeagueConfig, path: Path)
     """Publish the state after one update, in this process."""
     spaces = interface(config)
     registry.leagues.register(config, spaces)
-    algorithm = build_algorithm(config, spaces)
-    try:
+    with running(config) as algorithm:
         algorithm.train()
         algorithm.save_to_path(str(path))
-    finally:
-        algorithm.stop()
     source = Checkpoint(path, source="run/64", steps=64)
     row = publish(source, registry=registry, config=config, interface=spaces, parent=None, git_commit=None)
     assert all(policy.parity.mismatches == 0 for policy in row.manifest.policies.values())

@@ -44,7 +44,7 @@ BLOTTO = EnvironmentConfig(entry_point="policy_league.examples.blotto:env")
 @pytest.mark.parametrize(
     ("config", "vector"), [(KUHN, KuhnPokerVector), (LEDUC, LeducWithHistoryVector), (BLOTTO, BlottoVector)]
 )
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(plans)
 def test_the_vectorised_game_equals_the_stock_game(config: EnvironmentConfig, vector: Any, plan: Plan) -> None:
     assert_equal(config, vector(plan.num_envs), plan)
@@ -155,16 +155,16 @@ def test_observations_of_leduc_are_those_of_pettingzoo_and_the_actions_of_both_r
 
 def test_the_order_of_bets_of_leduc_is_visible() -> None:
     """Own 2 and the opponent's 4 chips: after a call and a raise, or a raise of the small blind."""
-    seen = []
+    observations = []
     for actions in ([CALL, RAISE], [RAISE]):
         game = leduc_holdem.env()
         game.reset(seed=0)
         for action in actions:
             game.step(action)
-        seen.append(game.observe(game.agent_selection)["observation"])
-    chips = [np.flatnonzero(each[6:STOCK_SIZE]).tolist() for each in seen]
+        observations.append(game.observe(game.agent_selection)["observation"])
+    chips = [np.flatnonzero(observation[6:STOCK_SIZE]).tolist() for observation in observations]
     assert chips[0] == chips[1]
-    assert (seen[0][STOCK_SIZE:] != seen[1][STOCK_SIZE:]).any()
+    assert (observations[0][STOCK_SIZE:] != observations[1][STOCK_SIZE:]).any()
 
 
 def test_a_player_sees_the_back_of_the_opponents_card() -> None:
@@ -263,9 +263,9 @@ def play(env: Any, actions: tuple[tuple[int, int], ...]) -> tuple[list[float], l
         ends.append(terminated.get("__all__", terminated.get(AGENTS[0], False)))
         states.append(observations)
         assert not any(truncated.values())
-    for seen in states:
-        np.testing.assert_array_equal(seen[AGENTS[0]], seen[AGENTS[1]])
-    return rewards, ends, [int(seen[AGENTS[0]].argmax()) for seen in states]
+    for state in states:
+        np.testing.assert_array_equal(state[AGENTS[0]], state[AGENTS[1]])
+    return rewards, ends, [int(state[AGENTS[0]].argmax()) for state in states]
 
 
 @pytest.mark.parametrize("make", [parallel_env, multi_agent_env])
@@ -279,14 +279,14 @@ def test_the_first_agent_selects_the_game_that_determines_the_rewards(make: Any)
 
 
 def test_values_equal_the_paper_and_enumeration() -> None:
-    found = values(GAMMA)
-    np.testing.assert_allclose(found[FIRST], [[6.93, 6.93], [7.92, 7.92]])
-    np.testing.assert_array_equal(found[GAME_A], np.full((2, 2), 7))
-    np.testing.assert_array_equal(found[GAME_B], [[0, 1], [1, 8]])
+    table = values(GAMMA)
+    np.testing.assert_allclose(table[FIRST], [[6.93, 6.93], [7.92, 7.92]])
+    np.testing.assert_array_equal(table[GAME_A], np.full((2, 2), 7))
+    np.testing.assert_array_equal(table[GAME_B], [[0, 1], [1, 8]])
     pairs = list(itertools.product(range(2), repeat=2))
     for pair in pairs:
         best = max(GAMMA * play(parallel_env(), (pair, later))[0][1] for later in pairs)
-        assert found[FIRST][pair] == best
+        assert table[FIRST][pair] == best
 
 
 def test_the_best_sum_prefers_the_worse_game() -> None:

@@ -158,9 +158,9 @@ def test_excess_requests_are_asked_to_retry(url: str) -> None:
 
     async def exceed() -> None:
         async with httpx.AsyncClient(timeout=30) as client:
-            load = drive(str(request.url), request.content, 48, lambda *_: is_running(), is_running)
+            calls = drive(str(request.url), request.content, 48, lambda *_: is_running(), is_running)
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(load)
+                tasks.create_task(calls)
                 while is_running():
                     reply = await client.send(request)
                     result.add((reply.status_code, reply.headers.get("retry-after")))

@@ -31,7 +31,7 @@ def listed() -> dict[str, tuple[dict, str | None]]:
 
 def shipped() -> set[str]:
     """All MultiAgentEnv classes under `ray.rllib.examples.envs.classes` whose modules can be imported."""
-    found = set()
+    classes = set()
     for info in pkgutil.walk_packages(examples.__path__, f"{examples.__name__}."):
         try:
             module = importlib.import_module(info.name)
@@ -41,8 +41,8 @@ def shipped() -> set[str]:
             # Classes that `make_multi_agent` returns have its module.
             is_own = getattr(value, "__module__", "") in (info.name, MultiAgentEnv.__module__)
             if isinstance(value, type) and issubclass(value, MultiAgentEnv) and value is not MultiAgentEnv and is_own:
-                found.add(f"{info.name.removeprefix(examples.__name__ + '.')}:{name}")
-    return found
+                classes.add(f"{info.name.removeprefix(examples.__name__ + '.')}:{name}")
+    return classes
 
 
 def test_the_page_lists_all_of_them() -> None:
@@ -57,8 +57,8 @@ def test_each_is_accepted_or_refused_as_listed(name: str) -> None:
     # Some toss a coin with these generators, whatever the seed is, and all tosses of a test may be equal.
     random.seed(0)
     np.random.seed(0)
-    found = examine(config, episodes=2)
-    faults = [str(finding) for finding in found.findings if finding.severity == "fault"]
+    examination = examine(config, episodes=2)
+    faults = [str(finding) for finding in examination.findings if finding.severity == "fault"]
     if reason is None:
         assert faults == []
     else:

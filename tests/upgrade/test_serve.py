@@ -171,8 +171,8 @@ class TestHAProxyConfiguration:
         self.start_with_stand_in(directory)
         check = [get_haproxy_binary(), "-c", "-f"]
         for name in ("haproxy.cfg", "standin.cfg"):
-            found = subprocess.run([*check, directory / name], capture_output=True, text=True, timeout=20)
-            assert found.returncode == 0, f"HAProxy refuses {name} after haproxy_script.py: {found.stderr}"
+            process = subprocess.run([*check, directory / name], capture_output=True, text=True, timeout=20)
+            assert process.returncode == 0, f"HAProxy refuses {name} after haproxy_script.py: {process.stderr}"
 
     def test_the_starting_page_responds_until_a_replica_is_known(self, directory: Path) -> None:
         """Ray's proxy would keep requests waiting; it is a backup in case of faults, once there were replicas."""
@@ -267,8 +267,8 @@ class TestUvicorn:
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "uvicorn.Config"
         ]
         assert calls, "Ray Serve no longer creates its uvicorn.Config in http_util"
-        for given in calls:
-            assert not given & {"http", "ws"}, (
+        for arguments in calls:
+            assert not arguments & {"http", "ws"}, (
                 "Ray Serve chooses uvicorn's protocols: uvicorn_http.install has no effect"
             )
 

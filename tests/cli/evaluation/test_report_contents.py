@@ -66,7 +66,7 @@ def plain(report: dict[str, Any]) -> dict[str, Any]:
 
 def recordings(report: dict[str, Any]) -> list[dict[str, Any]]:
     """The recorded games of a report."""
-    return [found for path, found in report["documents"].items() if "/games/" in path]
+    return [content for path, content in report["documents"].items() if "/games/" in path]
 
 
 def images(recording: dict[str, Any]) -> list[bytes]:
@@ -79,10 +79,10 @@ def test_documents_have_the_shape_of_the_api(report: dict[str, Any]) -> None:
     schemas = {"components": document(QUICK, [])["components"]}
     for path, schema in SCHEMAS.items():
         Draft202012Validator({"$ref": f"#/components/schemas/{schema}"} | schemas).validate(report["documents"][path])
-    for path, found in report["documents"].items():
+    for path, content in report["documents"].items():
         if path.startswith(f"{BASE}/verdicts/"):
-            Draft202012Validator({"$ref": "#/components/schemas/Verdict"} | schemas).validate(found)
-            assert found["curve"], path
+            Draft202012Validator({"$ref": "#/components/schemas/Verdict"} | schemas).validate(content)
+            assert content["curve"], path
     assert SCHEMAS.keys() < report["documents"].keys()
 
 

@@ -199,8 +199,8 @@ def test_scores_are_those_against_the_mixture(
 ) -> None:
     """The third version is left out: three of five opponents are the first version, the others the second."""
     payoff = ((0.5, 0.8, 0.2), (0.2, 0.5, 0.9), (0.8, 0.1, 0.5))
-    found = MetaStrategy(REFS, (1 / 2, 1 / 3, 1 / 6), payoff, 60, 0)
-    monkeypatch.setattr("league.results.payoffs.meta_strategy", lambda *_: found)
+    strategy = MetaStrategy(REFS, (1 / 2, 1 / 3, 1 / 6), payoff, 60, 0)
+    monkeypatch.setattr("league.results.payoffs.meta_strategy", lambda *_: strategy)
     lines = league("mixture", "tictactoe", "--at-least", "0.2").out.splitlines()[1:4]
     assert [line.split() for line in lines] == [
         ["tictactoe@1", "0.600", "0.620"],

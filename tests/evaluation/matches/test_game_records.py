@@ -589,11 +589,11 @@ def _check_counted_games(registry: Registry, conditions: Conditions, counted: li
     assert played.unique_games == len({game_digest(match, game) for match in matches for game in match.games})
     results = [match.result() for match in matches]
     for standing in played.leaderboard:
-        results = [
+        placed = [
             (result, place) for result in results for place in range(2) if result.contestants[place] == standing.ref
         ]
-        assert standing.games == sum(result.games for result, _ in results)
-        assert standing.score == sum(result.scores[place] for result, place in results) / standing.games
+        assert standing.games == sum(result.games for result, _ in placed)
+        assert standing.score == sum(result.scores[place] for result, place in placed) / standing.games
         of_ref = (match for match in matches if standing.ref in match.contestants)
         assert standing.unique_games == len({game_digest(match, game) for match in of_ref for game in match.games})
     if (payoff := played.payoff()) is not None:

@@ -204,14 +204,14 @@ def test_the_size_of_the_distribution_inputs() -> None:
 
 def test_unsupported_action_spaces_are_rejected() -> None:
     inputs, integers = np.zeros((1, 4), np.float32), Box(dtype="int8", shape=(2,), low=0, high=1)
-    unsupported: list[Space] = [MultiBinary(shape=(2,)), DictSpace(spaces={"move": Discrete(n=2)})]
+    composite: list[Space] = [MultiBinary(shape=(2,)), DictSpace(spaces={"move": Discrete(n=2)})]
     remedy = ": expected Discrete, MultiDiscrete or a Box of floats$"
     uses: list[tuple[Callable[[Space], object], list[Space], str]] = [
-        (dist_inputs_size, [integers, *unsupported], remedy),
-        (lambda space: to_environment(np.zeros((1, 2)), space), [integers, *unsupported], remedy),
-        (lambda space: sample(inputs, space, fixed(0.5)), unsupported, ""),
-        (lambda space: probabilities(inputs, space), unsupported, ""),
-        (lambda space: certain(inputs, space), unsupported, ""),
+        (dist_inputs_size, [integers, *composite], remedy),
+        (lambda space: to_environment(np.zeros((1, 2)), space), [integers, *composite], remedy),
+        (lambda space: sample(inputs, space, fixed(0.5)), composite, ""),
+        (lambda space: probabilities(inputs, space), composite, ""),
+        (lambda space: certain(inputs, space), composite, ""),
     ]
     for use, unsupported, ending in uses:
         for space in unsupported:
