@@ -6,13 +6,13 @@ from typing import Any
 import pytest
 
 from league.config.league import LeagueConfig
-from league.errors import ConfigError
+from league.errors import ConfigError, InterfaceChanged
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage.manifest import EXPLOITER, Manifest
 from tests.support.leagues import registries
 from tests.support.leagues.registries import LEAGUE
-from training.runs.parent import check_network, start_version
+from training.runs.parent import check_network, parent_version, start_version
 
 
 def publish(registry: Registry, **manifest: Any) -> CheckpointRef:
@@ -45,6 +45,24 @@ def test_in_place_of_an_imported_version_the_newest_one_continues(registry: Regi
     publish(registry, role=EXPLOITER, exploits=str(imported))
     publish(registry, algorithm="imported")
     assert start_version(registry, imported, registries.config(), None) == trained
+
+
+def test_mixtures_search_versions_and_other_leagues_or_spaces_are_refused(registry: Registry) -> None:
+    config, interface = registries.config(), registry.leagues.get(LEAGUE).interface
+    first, second = publish(registry), publish(registry)
+    assert parent_version(registry, first, config, interface).number == 1
+    registry.publisher.publish_mixture(LEAGUE, {1: 0.25, 2: 0.75})
+    registry.publisher.publish_search(LEAGUE, 1, "puct", 8, 1.0)
+    for ref, error, message in (
+        (CheckpointRef("chess", 1), ConfigError, "chess@1 belongs to another league than tictactoe"),
+        (CheckpointRef(LEAGUE, 3), ConfigError, r"tictactoe@3 is a mixture .*: start from one of its members"),
+        (CheckpointRef(LEAGUE, 4), ConfigError, r"tictactoe@4 searches .*: start from @1"),
+    ):
+        with pytest.raises(error, match=f"^--from: {message}"):
+            parent_version(registry, ref, config, interface)
+    fewer = interface.model_copy(update={"agents": {}})
+    with pytest.raises(InterfaceChanged, match="tictactoe@2 has other spaces or policies than the environment now"):
+        parent_version(registry, second, config, fewer)
 
 
 def with_algorithm(algorithm: str) -> LeagueConfig:
