@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from league.errors import ConfigError, NotReady, one_line
+from league.interruption import hangup_blocked
 from league.local_ray.loopback_node import (
     LIMITS,
     WAITING_WORKERS,
@@ -108,7 +109,7 @@ def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
     create_token()
     for attempt in range(ATTEMPTS):
         try:
-            with _node_variables(local), loopback_node(local.runtime_envs or local.dashboard):
+            with hangup_blocked(), _node_variables(local), loopback_node(local.runtime_envs or local.dashboard):
                 dashboard = _connect(
                     address="local",
                     num_cpus=local.cpus,
@@ -121,7 +122,8 @@ def start_local(local: LocalRay = UNLIMITED, **options: Any) -> str | None:
             if attempt == ATTEMPTS - 1:
                 raise NotReady(f"Ray did not start: {error}") from error
         except Exception as error:
-            raise NotReady(f"Ray did not start: {one_line(error)}") from error
+            remedy = ": set RAY_TMPDIR to a shorter path, such as /tmp" if "AF_UNIX path length" in str(error) else ""
+            raise NotReady(f"Ray did not start: {one_line(error)}{remedy}") from error
     return dashboard
 
 

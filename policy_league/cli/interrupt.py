@@ -1,4 +1,4 @@
-"""What Ctrl-C does to commands that can be continued."""
+"""What signals do to commands that can be continued."""
 
 import os
 import sys
@@ -7,15 +7,13 @@ from contextlib import contextmanager
 
 import typer
 
+from league.interruption import exit_code
 from policy_league.cli.output import say
-
-INTERRUPTED = 130
-"""Exit code of a process ended by SIGINT: 128 + 2."""
 
 
 @contextmanager
 def exit_on_interrupt() -> Iterator[None]:
-    """Turn Ctrl-C into a message and exit code 130. Without a message the process exits at once."""
+    """Turn an interrupt into a message and the signal's exit code. Without a message the process exits at once."""
     try:
         yield
     except KeyboardInterrupt as end:
@@ -24,6 +22,6 @@ def exit_on_interrupt() -> Iterator[None]:
             # the version.
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(INTERRUPTED)
+            os._exit(exit_code())
         say(f"\n{end}")
-        raise typer.Exit(INTERRUPTED) from end
+        raise typer.Exit(exit_code()) from end

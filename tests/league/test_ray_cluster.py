@@ -57,10 +57,14 @@ def test_an_object_store_that_is_too_small_is_rejected() -> None:
 
 def test_a_ray_that_does_not_start_is_reported_on_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def init(**_: object) -> None:
-        raise Exception("The current node timed out\nduring startup.")
+        raise Exception(fault)
 
     monkeypatch.setattr(ray, "init", init)
+    fault = "The current node timed out\nduring startup."
     with pytest.raises(NotReady, match=r"^Ray did not start: The current node timed out during startup\.$"):
+        start_local(LocalRay(cpus=1))
+    fault = "validate_socket_filename failed: AF_UNIX path length cannot exceed 107 bytes: /tmp/ddd/plasma_store"
+    with pytest.raises(NotReady, match=r"plasma_store: set RAY_TMPDIR to a shorter path, such as /tmp$"):
         start_local(LocalRay(cpus=1))
 
 

@@ -1,16 +1,14 @@
 """Runs trials with Ray Tune: resources, experiment configuration, and graceful interrupts."""
 
 import math
-import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from ray import tune
 
 from league.errors import ConfigError
+from league.interruption import on_ending_signals
 from league.ray_cluster import has_autoscaler, node_resources
 from training.algorithms.resources import Resources
 from training.rllib_compat import restored_sigusr1
@@ -108,7 +106,6 @@ def _gpus(count: float) -> dict[str, float]:
 
 ROUNDING = 1e-9
 """Rounding error of a quotient of resources, which Ray counts in units of 0.0001."""
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(KeyboardInterrupt):
@@ -120,28 +117,18 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def graceful_interrupt(ask: Callable[[], None]) -> Iterator[None]:
-    """Call `ask` at the first SIGINT or SIGTERM, and raise KeyboardInterrupt at the next.
-
-    Does nothing outside the main thread, where Python cannot handle signals.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    """Call `ask` at the first signal that ends a command, and raise KeyboardInterrupt at the next."""
     is_interrupted = False
 
-    def handle(*_: Any) -> None:
+    def handle() -> None:
         nonlocal is_interrupted
         if is_interrupted:
             raise KeyboardInterrupt
         is_interrupted = True
         ask()
 
-    before = {number: signal.signal(number, handle) for number in SIGNALS}
-    try:
+    with on_ending_signals(handle):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def run_config(path: Path, callbacks: list[tune.Callback], stop: tune.Stopper) -> tune.RunConfig:

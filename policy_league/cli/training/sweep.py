@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from policy_league.cli.interrupt import INTERRUPTED, exit_on_interrupt
+from league.interruption import exit_code
+from policy_league.cli.interrupt import exit_on_interrupt
 from policy_league.cli.options import Config, open_registry
 from policy_league.cli.output import console, say, table
 from policy_league.cli.training.options import TrainingOptions, with_training_options
@@ -53,7 +54,7 @@ def sweep(
         )
     _show(report, config)
     if not report.is_whole:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(exit_code())
 
 
 def _show(report: "SweepReport", config: str) -> None:
