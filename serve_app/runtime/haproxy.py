@@ -1,13 +1,15 @@
 """Environment variables that make Ray Serve answer through HAProxy, and termination of HAProxy's processes.
 
 HAProxy is a child of a Ray worker: if Ray is killed, HAProxy survives and keeps the port. Therefore each server has a
-directory of its own that identifies its HAProxy processes, and holds a lock on it while it runs.
+directory of its own that identifies its HAProxy processes, and holds a lock on it while it runs. A process that waits
+for the end of the server stops them if the server itself was killed.
 
 Ray generates HAProxy's configuration. No setting of Ray restricts the statistics pages to this machine or limits the
 time to send a request, and Ray takes seconds to replace HAProxy after a crash. Therefore Ray starts a wrapper script
 (serve_app.runtime.haproxy_script) instead of HAProxy.
 """
 
+import errno
 import fcntl
 import os
 import random
@@ -16,19 +18,22 @@ import shutil
 import signal
 import socket
 import stat
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from league.errors import NotReady
+from league.errors import ConfigError, NotReady
 from league.ray_cluster import usable_cpus
+from league.subprocesses import Subprocess
 from serve_app.runtime import haproxy_script, worker_start
 
 DIRECTORIES = Path("/tmp")
 PREFIX = "league-serve-"
 """Short, because the path of HAProxy's socket is limited to 97 characters, of which Ray adds 57."""
 LOCK = "lock"
+ALL_INTERFACES = "0.0.0.0"
 PORTS = range(25_000, 30_000)
 """Range of free ports: below the kernel's ephemeral ports, and apart from the claimed blocks."""
 GRPC_PORT_FILE = "grpc"
@@ -105,7 +110,8 @@ def environment(directory: Path) -> dict[str, str]:
 def private_directory() -> Iterator[Path]:
     """A directory for the HAProxy of one server. On exit its processes are stopped and it is removed.
 
-    Directories of servers that were killed are cleaned up first.
+    A subprocess does so if this process is killed. Directories of servers whose subprocess was killed too are cleaned
+    up first.
     """
     for abandoned in _own_directories():
         with suppress(OSError), _locked(abandoned) as is_abandoned:
@@ -117,14 +123,16 @@ def private_directory() -> Iterator[Path]:
     (unlocked / LOCK).touch()
     with _locked(unlocked):
         unlocked.rename(directory)  # visible to other servers only after it is locked
+        cleaner = Subprocess(__name__, str(directory))
         try:
             yield directory
         finally:
             _remove(directory)
+            cleaner.stop()
 
 
-def free_ports(count: int, host: str = "", ports: range = PORTS) -> list[int]:
-    """Unused ports of `host` (default: all interfaces)."""
+def free_ports(count: int, host: str = ALL_INTERFACES, ports: range = PORTS) -> list[int]:
+    """Unused ports of `host`. Raises ConfigError as `is_free`, and NotReady if there are fewer."""
     unused_ports = []
     for port in random.sample(ports, len(ports)):
         if is_free(host, port):
@@ -151,20 +159,44 @@ def _claim_grpc_ports(directory: Path) -> range:
     claimed_starts = {int(claim.read_text()) for claim in claims if claim.exists()}
     for start in random.sample(GRPC_PORTS, len(GRPC_PORTS)):
         block = range(start, start + GRPC_PORTS.step)
-        if start not in claimed_starts and all(is_free("", port) for port in block):
+        if start not in claimed_starts and all(is_free(ALL_INTERFACES, port) for port in block):
             (directory / GRPC_PORT_FILE).write_text(str(start))
             return block
     raise NotReady(f"found no block of {GRPC_PORTS.step} free ports from {GRPC_PORTS.start}")
 
 
+def listening_address(host: str) -> tuple[socket.AddressFamily, str]:
+    """The address on which a server listens, and its family. A name stands for its IPv4 address, if it has one.
+
+    Raises ConfigError if the host is neither an address nor a known name.
+    """
+    try:
+        addresses = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a host name"
+        raise ConfigError(
+            f"cannot listen on {host}: {reason}; expected an address or a name of this machine"
+        ) from error
+    family, *_, address = min(addresses, key=lambda entry: entry[0] != socket.AF_INET)
+    return family, str(address[0])
+
+
 def is_free(host: str, port: int) -> bool:
-    """Whether a server can listen on a port."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError:
+    """Whether no other server uses a port.
+
+    Raises ConfigError, with the reason of the operating system, if no server of this user can listen on it.
+    """
+    if not 0 < port < 2**16:
+        raise ConfigError(f"a port must be from 1 to 65535, got {port}")
+    family, address = listening_address(host)
+    try:
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((address, port))
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
             return False
+        raise ConfigError(f"cannot listen on port {port} of {host}: {error.strerror}") from error
     return True
 
 
@@ -209,3 +241,13 @@ def _locked(directory: Path) -> Iterator[bool]:
             yield False
             return
         yield True
+
+
+def main() -> None:
+    """Wait until the server whose directory is the argument has ended, and remove what it has left."""
+    sys.stdin.buffer.read()
+    _remove(Path(sys.argv[1]))
+
+
+if __name__ == "__main__":
+    main()

@@ -14,6 +14,9 @@ its response unless its key was accepted.
 A restarted controller waits at most ten seconds for its replicas to report, then it announces the application without
 them. The replicas run, so HAProxy keeps those that it knows until the controller names some. Its health checks
 find those that do not.
+
+Ray's HAProxy calls the replicas of its node at 127.0.0.1. They listen on the server's host, as HAProxy does, so the
+script replaces the address.
 """
 
 import json
@@ -58,6 +61,8 @@ HTTP = f"""
     http-after-response set-header x-content-type-options nosniff"""
 """Lines of the HTTP frontend. A request is forwarded once its body has arrived or fills the buffer, so that slow
 clients occupy no replica."""
+ALL_OF_IPV6 = "::0"
+"""All addresses. Ray would let HAProxy listen on those of IPv4 only for `::`."""
 RAY_PORTS = {"STATS": "8404", "METRICS": "9101"}
 """HAProxy's own ports, unless Ray's environment variables change them."""
 ERRORS = {
@@ -77,7 +82,14 @@ amend() {{  # Ray's configuration
         [ "${{connections:-0}}" -gt "$most" ] && connections=$most
     fi
     : "${{connections:=2000}}"
+    host=$(sed -n '/^frontend http_frontend$/,/^[^ ]/s/^ *bind \\(.*\\):[0-9]*$/\\1/p' "$1")
+    case $host in
+        '' | *[!0-9A-Fa-f.:]*) replicas=127.0.0.1 ;;  # all addresses of IPv4, or a name
+        {all_of_ipv6}) replicas=::1 ;;
+        *) replicas=$host ;;
+    esac
     sed -i \\
+        -e "s/^\\( *server [^ ]* \\)127[.]0[.]0[.]1\\(:[0-9]* check\\)/\\1$replicas\\2/" \\
         -e 's/^\\( *bind \\)[*]\\{{0,1\\}}:\\({stats}\\|{metrics}\\)$/\\1127.0.0.1:\\2/' \\
         -e "s/^\\( *maxconn \\)[0-9]*\\$/\\1$connections/" \\
         -e 's|^defaults$|&{timeouts}|' \\
@@ -176,6 +188,7 @@ def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
         reserved=RESERVED_DESCRIPTORS,
         stopped=STOPPED,
         stand_in=STAND_IN,
+        all_of_ipv6=ALL_OF_IPV6,
     )
 
 

@@ -25,6 +25,7 @@ from pydantic import ValidationError
 from league import errors
 from league.config.validation_errors import describe_validation_error
 from league.errors import AlreadyRunning, ConfigError, LeagueError, NotReady, last_line, one_line
+from league.interruption import on_ending_signals
 from league.ray_cluster import LocalRay, check_stacks, join, node_addresses, ray_session, start_local, usable_cpus
 from league.registry.registry import Registry
 from league.settings import Storage
@@ -61,13 +62,14 @@ def serve_forever(
     deploy: Path = DEPLOY_YAML,
     on_ready: OnReady | None = None,
 ) -> None:
-    """Serve the leagues of `storage` until SIGINT or SIGTERM, then shut down. Prints nothing.
+    """Serve the leagues of `storage` until SIGINT, SIGTERM or SIGHUP, then shut down. Prints nothing.
 
-    Must be called in the main thread of a process that has not imported ray.
+    SIGHUP stays ignored if it was ignored before, as after `nohup`. Must be called in the main thread of a process that
+    has not imported ray.
 
     Args:
         storage: Leagues to serve.
-        host: Address to listen on; None for that of `deploy`.
+        host: IPv4 or IPv6 address to listen on, or the name of one; None for that of `deploy`.
         port: HTTP port; None for that of `deploy`.
         grpc_port: gRPC port; None for that of `deploy`.
         replicas: Number of replicas, or the minimum if `max_replicas` is larger; None for that of `deploy`.
@@ -81,8 +83,8 @@ def serve_forever(
         on_ready: Called once when every replica answers.
 
     Raises:
-        ConfigError: deploy.yaml is invalid, the cluster is unreachable or cannot reach the storage, or other machines
-            could call the server without a key.
+        ConfigError: deploy.yaml is invalid, the cluster is unreachable or cannot reach the storage, other machines
+            could call the server without a key, or the operating system does not let it listen on a port.
         AlreadyRunning: A port is in use.
         StorageError: The home directory cannot be used.
         NotReady: HAProxy is missing, or the replicas did not start.
@@ -93,7 +95,7 @@ def serve_forever(
     _check_exposure(document, storage)
     storage.export()
     try:
-        with _signals_interrupt():
+        with on_ending_signals(_interrupt):
             if address is None:
                 _serve_locally(document, dashboard, on_ready)
             else:
@@ -251,7 +253,8 @@ def _check_exposure(document: dict[str, Any], storage: Storage) -> None:
 
 def _serve_locally(document: dict[str, Any], dashboard: bool, on_ready: OnReady | None) -> None:
     """Serve on a local Ray."""
-    host, port = document["http_options"]["host"], document["http_options"]["port"]
+    http = document["http_options"]
+    host, port = http["host"], http["port"]
     grpc = document.get("grpc_options", {})
     with haproxy.private_directory() as directory, ExitStack() as until_stopped:
         for option, requested_port in [("--port", port), *([("--grpc-port", grpc["port"])] if grpc else [])]:
@@ -259,9 +262,11 @@ def _serve_locally(document: dict[str, Any], dashboard: bool, on_ready: OnReady 
                 raise AlreadyRunning(
                     f"port {requested_port} of {host} is in use: stop the other server, or choose another with {option}"
                 )
+        # HAProxy and Ray could choose different addresses of a name.
+        _, http["host"] = haproxy.listening_address(host)
         binary = haproxy_script.find_haproxy()
         if binary is not None:  # otherwise `check_haproxy` raises
-            until_stopped.enter_context(starting_page(directory, binary, host, port, grpc.get("port")))
+            until_stopped.enter_context(starting_page(directory, binary, http["host"], port, grpc.get("port")))
         largest = {"RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(_settings(document).max_body)}
         for name, value in (haproxy.environment(directory) | largest).items():
             os.environ.setdefault(name, value)
@@ -308,15 +313,16 @@ def _deploy(document: dict[str, Any], on_ready: OnReady | None, dashboard: str |
     except ValidationError as error:
         raise ConfigError(f"deploy.yaml: {one_line(error)}") from error
     logging.getLogger("ray.serve").setLevel(logging.ERROR)  # this process only: the others log to files
-    _interrupt_on_signals()  # ray.init has replaced the handlers
-    ray_serve.deploy(schema)
-    url = f"http://{schema.http_options.host}:{schema.http_options.port}"
-    (application,) = schema.applications
-    _await_replicas(application.name, application.deployments[0].name, url.replace("0.0.0.0", "127.0.0.1"))
-    if on_ready is not None:
-        on_ready(url, ray_serve.log_directory(), f"http://{dashboard}" if dashboard else None)
-    while True:
-        signal.pause()
+    with on_ending_signals(_interrupt):  # ray.init has replaced the handlers
+        ray_serve.deploy(schema)
+        host, port = str(schema.http_options.host), schema.http_options.port
+        (application,) = schema.applications
+        _await_replicas(application.name, application.deployments[0].name, ray_serve.url_here(host, port))
+        if on_ready is not None:
+            url = ray_serve.url_of(host, port)
+            on_ready(url, ray_serve.log_directory(), f"http://{dashboard}" if dashboard else None)
+        while True:
+            signal.pause()
 
 
 def _await_replicas(application: str, deployment: str, url: str) -> None:
@@ -358,21 +364,8 @@ def _errors_of_ray() -> Iterator[None]:
         raise NotReady(f"Ray Serve did not start: {last_line(str(error))}") from error
 
 
-@contextmanager
-def _signals_interrupt() -> Iterator[None]:
-    """Make SIGTERM raise KeyboardInterrupt, as SIGINT does; restore the former handlers on exit."""
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    _interrupt_on_signals()
-    try:
-        yield
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
-
-
-def _interrupt_on_signals() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+def _interrupt() -> NoReturn:
+    raise KeyboardInterrupt
 
 
 def _await_url(server: Subprocess, log: IO[bytes], timeout: float) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from league.errors import NotReady
+from serve_app.runtime.haproxy_script import ALL_OF_IPV6
 from serve_app.runtime.replica_process import LOOPBACK, ReplicaProcess, this_process
 from serve_app.runtime.worker_start import import_serve
 from serve_app.settings import is_exposed
@@ -24,7 +25,8 @@ logger = logging.getLogger("ray.serve.policy_league")
 logger.setLevel(logging.INFO)
 
 
-ALL_INTERFACES = ("0.0.0.0", "::")
+HOSTS_HERE = {"0.0.0.0": LOOPBACK, "::": "::1", ALL_OF_IPV6: "::1"}
+"""Listening address of all interfaces → the address for programs of the same machine."""
 RUNNING_REQUESTS = "running_requests"
 """Ray Serve's statistic of requests in progress in a replica. One that the replica records takes its place."""
 
@@ -58,7 +60,17 @@ def own_url(host: str) -> str:
     host: on which it listens.
     """
     port = next((port for replica in _replicas() if (port := getattr(replica, "_http_port", None))), None)
-    return "" if port is None else f"http://{LOOPBACK if host in ALL_INTERFACES else host}:{port}"
+    return "" if port is None else url_here(host, port)
+
+
+def url_of(host: str, port: int) -> str:
+    """The URL of a server."""
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def url_here(host: str, port: int) -> str:
+    """The URL of a server for programs of its machine. host: on which it listens."""
+    return url_of(HOSTS_HERE.get(host, host), port)
 
 
 def _replicas() -> Iterator[Any]:
@@ -149,8 +161,9 @@ def deploy(schema: "ServeDeploySchema") -> None:
     """Start Ray Serve with the options of a schema, and deploy its applications without waiting for them."""
     from ray.serve._private.api import serve_start
 
+    host = schema.http_options.host
     client = serve_start(
-        http_options=schema.http_options.model_dump(),
+        http_options=schema.http_options.model_dump() | {"host": ALL_OF_IPV6 if host == "::" else host},
         grpc_options=schema.grpc_options.model_dump(),
         proxy_location=schema.proxy_location,
     )

@@ -4,6 +4,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -40,6 +42,7 @@ from tests.support.clients.actions import BOARD
 from tests.support.clients.event_streams import listen
 from tests.support.clients.protocol_observations import observations, policy_of
 from tests.support.clients.triton import FORMS, Triton, assert_same
+from tests.support.ipv6 import needs_ipv6
 from tests.support.leagues import tictactoe
 from tests.support.leagues.served_leagues import promote
 from tests.support.servers.protocol_servers import Address
@@ -519,11 +522,34 @@ def test_a_killed_server_can_be_restarted(storage: Storage) -> None:
     (port,) = haproxy.free_ports(1, "127.0.0.1")
     with running(storage, port=port, replicas=1) as url:
         os.kill(launcher(port), signal.SIGKILL)
+        until(lambda: haproxy.is_free("127.0.0.1", port))  # not only when the next server starts
         with running(storage, port=port, replicas=1) as restarted:
             assert restarted == url
             reply = httpx.post(f"{url}{ACTION}", json={"observation": BOARD})
             assert reply.json()["version"] == 1
     assert haproxy.is_free("127.0.0.1", port)
+
+
+@needs_ipv6
+def test_a_server_on_ipv6_answers_until_its_terminal_closes(storage: Storage) -> None:
+    port, grpc_port = haproxy.free_ports(2, "::1")
+    command = [str(Path(sys.executable).with_name("league")), "serve", "--host", "::1"]
+    command += ["--port", str(port), "--grpc-port", str(grpc_port), "--replicas", "1"]
+    environment = os.environ | storage.environment
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            lines = iter(server.stdout.readline, "")
+            assert f"on http://[::1]:{port}" in next(line for line in lines if line.startswith("Serving"))
+            reply = httpx.post(f"http://[::1]:{port}{ACTION}", json={"observation": BOARD}, trust_env=False)
+            assert reply.json()["version"] == 1
+            assert tritonclient.grpc.InferenceServerClient(f"[::1]:{grpc_port}").is_server_ready()
+            server.send_signal(signal.SIGHUP)
+            assert server.wait(60) == 128 + signal.SIGHUP
+        finally:
+            server.kill()
+    assert haproxy.is_free("::1", port)
+    assert haproxy.is_free("::1", grpc_port)
 
 
 def launcher(port: int) -> int:

@@ -468,3 +468,8 @@ def test_a_replica_knows_its_own_url(monkeypatch: pytest.MonkeyPatch) -> None:
     actor._replica_impl._http_port = 30_001
     assert ray_serve.own_url("0.0.0.0") == "http://127.0.0.1:30001"
     assert ray_serve.own_url("10.0.0.7") == "http://10.0.0.7:30001"
+
+
+def test_ray_lets_haproxy_listen_on_all_addresses_of_ipv6() -> None:
+    hosts = {host: HAProxyConfig(http_options=HTTPOptions(host=host)).frontend_host for host in ("::", "::0")}
+    assert hosts == {"::": "*", haproxy_script.ALL_OF_IPV6: haproxy_script.ALL_OF_IPV6}

@@ -1,9 +1,11 @@
 """`league serve`."""
 
+import signal
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from league.interruption import exit_code
 from league.refs import CHAMPION
 from league.settings import Storage
 from policy_league.cli.options import DEFAULT_URL, open_registry
@@ -11,6 +13,9 @@ from policy_league.cli.output import say
 
 if TYPE_CHECKING:
     from league.registry.registry import Registry
+
+INTERRUPTED = 128 + signal.SIGINT
+"""Ctrl-C is the usual end of a server, and no failure."""
 
 
 def serve(
@@ -71,6 +76,8 @@ def serve(
             + "Stop: Ctrl-C"
         ),
     )
+    if (code := exit_code()) != INTERRUPTED:
+        raise typer.Exit(code)
 
 
 def hints(registry: "Registry", url: str) -> str:
@@ -81,7 +88,7 @@ def hints(registry: "Registry", url: str) -> str:
     promoted = {league: target.event for (league, alias), target in registry.aliases.all().items() if alias == CHAMPION}
     newest = max(promoted, key=lambda league: promoted[league], default=None)
     model = newest or "LEAGUE"
-    called = url.replace("//0.0.0.0:", "//127.0.0.1:")
+    called = url.replace("//0.0.0.0:", "//127.0.0.1:").replace("//[::]:", "//[::1]:")
     addresses = {
         called: "web pages",
         f"{called}/docs": "API documentation",

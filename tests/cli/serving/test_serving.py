@@ -121,6 +121,13 @@ def test_a_server_that_does_not_answer(league: League, registry: Registry, monke
     assert "`league serve` starts a server, --url names another, --local needs none" in result.err
 
 
+def test_a_server_of_another_machine_needs_an_observation(league: League, home: Path) -> None:
+    result = league("act", "tictactoe", "--url", "http://policies.example:8000")
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert result.err.startswith("league: pass --observation: the first one of an episode can be computed only where")
+    assert not home.exists()
+
+
 def test_a_search_version_acts_locally_and_explains_itself(league: League, registry: Registry) -> None:
     value = masked_mlp((3, 3, 2), 9, has_value=True)
     base = tictactoe.publish(registry, masked_mlp((3, 3, 2), 9), value=value)
@@ -147,5 +154,6 @@ def test_the_hints_of_a_server_name_the_league_that_was_promoted_last(registry: 
     on_all_interfaces = hints(registry, "http://0.0.0.0:9")
     assert "0.0.0.0" not in on_all_interfaces
     assert on_all_interfaces.endswith("--url http://127.0.0.1:9")
+    assert hints(registry, "http://[::]:9").endswith("--url http://[::1]:9")
     with closing(Registry.open(Storage.at(tmp_path / "empty"))) as empty:
         assert "league train CONFIG, then league nightly" in hints(empty, "http://127.0.0.1:8000")

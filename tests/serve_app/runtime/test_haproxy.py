@@ -15,9 +15,10 @@ import psutil
 import pytest
 from starlette.types import Receive, Scope, Send
 
-from league.errors import NotReady
+from league.errors import ConfigError, NotReady
 from serve_app.runtime import haproxy, haproxy_script
 from serve_app.runtime.starting_page import starting_page
+from tests.support.ipv6 import needs_ipv6
 from tests.support.servers.http_protocol import serving
 from tests.support.waiting import until
 
@@ -74,6 +75,28 @@ def test_the_files_of_a_killed_server_are_removed(directories: Path) -> None:
     left.stdout.close()
 
 
+SERVER = """
+import signal, sys
+from pathlib import Path
+from serve_app.runtime import haproxy
+from serve_app.runtime.starting_page import starting_page
+
+folder, binary, port = sys.argv[1:]
+haproxy.DIRECTORIES = Path(folder)
+with haproxy.private_directory() as directory, starting_page(directory, binary, "127.0.0.1", int(port), None):
+    signal.pause()
+"""
+
+
+def test_a_killed_server_leaves_neither_haproxy_nor_files(directories: Path) -> None:
+    (port,) = haproxy.free_ports(1, "127.0.0.1")
+    with subprocess.Popen([sys.executable, "-c", SERVER, str(directories), BINARY, str(port)]) as server:
+        until(lambda: not haproxy.is_free("127.0.0.1", port))
+        server.kill()
+    until(lambda: haproxy.is_free("127.0.0.1", port), seconds=60)
+    until(lambda: not list(directories.iterdir()), seconds=60)
+
+
 @pytest.mark.timeout(60)
 def test_directories_of_other_users_are_not_opened(directories: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Opening a pipe would block, and the content of a file would be trusted."""
@@ -96,6 +119,31 @@ def test_free_ports_are_free(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(haproxy, "is_free", lambda *_: False)
     with pytest.raises(NotReady, match="fewer than 2 free ports"):
         haproxy.free_ports(2)
+
+
+@needs_ipv6
+def test_ports_of_ipv6_addresses_may_be_in_use() -> None:
+    (port,) = haproxy.free_ports(1, "::1")
+    with socket.create_server(("::1", port), family=socket.AF_INET6):
+        assert not haproxy.is_free("::1", port)
+
+
+def test_the_reason_why_no_server_can_listen_is_reported(subtests: pytest.Subtests) -> None:
+    """A port in use is another matter: a server can listen on the next one."""
+    elsewhere = "expected an address or a name of this machine"
+    for host, port, message in (
+        ("203.0.113.1", 8000, "cannot listen on port 8000 of 203.0.113.1: Cannot assign requested address"),
+        ("2001:db8::1", 8000, "cannot listen on port 8000 of 2001:db8::1: Cannot assign requested address"),
+        ("127.0.0.1:8620", 8000, f"cannot listen on 127.0.0.1:8620: Name or service not known; {elsewhere}"),
+        ("a..b", 8000, f"cannot listen on a..b: not a host name; {elsewhere}"),
+        ("127.0.0.1", 0, "a port must be from 1 to 65535, got 0"),
+        ("127.0.0.1", 65_536, "a port must be from 1 to 65535, got 65536"),
+    ):
+        with subtests.test(host=host, port=port), pytest.raises(ConfigError) as caught:
+            haproxy.is_free(host, port)
+        assert str(caught.value) == message
+    with pytest.raises(ConfigError, match=r"cannot listen on port \d+ of 203\.0\.113\.1"):
+        haproxy.free_ports(1, "203.0.113.1")
 
 
 @pytest.mark.usefixtures("directories")
@@ -136,6 +184,15 @@ def test_http_requests_are_answered_with_503_and_a_page_or_a_document(ports: tup
             assert (response.status_code, response.headers["retry-after"]) == (503, "1")
             assert response.json() == expected
         assert client.post("/v1/policies/board/action", json={}).status_code == 503
+
+
+@needs_ipv6
+def test_the_page_is_served_on_addresses_of_ipv6(tmp_path: Path) -> None:
+    for host in ("::1", "::"):
+        http, rpc = haproxy.free_ports(2, host)
+        with starting_page(tmp_path, BINARY, host, http, rpc):
+            until(lambda host=host, http=http: not haproxy.is_free(host, http))
+            assert httpx.get(f"http://[::1]:{http}/v1/leagues", trust_env=False).status_code == 503
 
 
 def test_grpc_calls_are_answered_with_unavailable(ports: tuple[int, int]) -> None:
@@ -308,6 +365,43 @@ def test_the_last_known_replicas_are_kept_while_the_controller_finds_them_again(
     assert servers_after(REPLICAS.replace("two", "three")) == ["one", "three", head], "one is replaced"
     assert sorted(servers_after("")) == [head, "one", "three"]
     until(lambda: not processes_of(tmp_path))  # no stand-in waits for the end of an HAProxy that has ended
+
+
+LISTENING = """frontend http_frontend
+    bind {host}:8000
+backend http-league
+    server here 127.0.0.1:30000 check observe layer4
+    server elsewhere 10.0.0.8:30000 check observe layer4
+    server fallback 127.0.0.1:8500 check backup
+frontend grpc_frontend
+    bind {host}:8001 proto h2
+backend grpc-league
+    server here 127.0.0.1:30001 proto h2 check observe layer4
+"""
+
+
+def test_haproxy_calls_replicas_where_they_listen(tmp_path: Path, subtests: pytest.Subtests) -> None:
+    """Their HTTP servers listen on the host of the server, those of gRPC on loopback or on all interfaces."""
+    configuration, wrapper = tmp_path / "haproxy.cfg", installed(tmp_path)
+    for host, address in (
+        ("127.0.0.1", "127.0.0.1"),
+        ("*", "127.0.0.1"),
+        ("localhost", "127.0.0.1"),
+        ("10.0.0.7", "10.0.0.7"),
+        ("::1", "::1"),
+        ("FD00::2", "FD00::2"),
+        (haproxy_script.ALL_OF_IPV6, "::1"),
+    ):
+        with subtests.test(host=host):
+            configuration.write_text(LISTENING.format(host=host))
+            subprocess.run([str(wrapper), "-f", str(configuration)], check=True, timeout=60)
+            lines = configuration.read_text().splitlines()
+            assert [line.split()[2] for line in lines if line.startswith("    server ")] == [
+                f"{address}:30000",
+                "10.0.0.8:30000",
+                f"{address}:8500",
+                "127.0.0.1:30001",
+            ]
 
 
 PROXY = """defaults

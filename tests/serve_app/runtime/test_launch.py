@@ -25,7 +25,7 @@ from starlette.types import Receive, Scope, Send
 from league.errors import AlreadyRunning, ConfigError, NotReady, StorageError
 from league.registry.replicas import LIVENESS_TIMEOUT
 from league.settings import Storage
-from serve_app.runtime import haproxy, launch, serve_bypass
+from serve_app.runtime import haproxy, launch, ray_serve, serve_bypass
 from serve_app.runtime.autoscaling import LOAD, MARGIN, STALE, LoadPolicy, required_replicas
 from serve_app.runtime.launch import DEPLOY_YAML, load_document, running
 from serve_app.runtime.replica_process import has_ended, this_process
@@ -46,6 +46,22 @@ def test_a_port_in_use_is_reported() -> None:
             document = load_document(DEPLOY_YAML, None, http, grpc, None, None, insecure=False)
             with pytest.raises(AlreadyRunning, match=f"port {port} of 127.0.0.1 is in use"):
                 launch._serve_locally(document, dashboard=False, on_ready=None)
+
+
+def test_a_host_that_is_not_of_this_machine_is_reported() -> None:
+    document = load_document(DEPLOY_YAML, "203.0.113.1", None, None, None, None, insecure=True)
+    with pytest.raises(ConfigError, match=r"203\.0\.113\.1: Cannot assign requested address"):
+        launch._serve_locally(document, dashboard=False, on_ready=None)
+
+
+def test_the_urls_of_a_server() -> None:
+    for host, url, url_here in (
+        ("127.0.0.1", "http://127.0.0.1:80", "http://127.0.0.1:80"),
+        ("0.0.0.0", "http://0.0.0.0:80", "http://127.0.0.1:80"),
+        ("::1", "http://[::1]:80", "http://[::1]:80"),
+        ("::", "http://[::]:80", "http://[::1]:80"),
+    ):
+        assert (ray_serve.url_of(host, 80), ray_serve.url_here(host, 80)) == (url, url_here)
 
 
 def test_invalid_settings_are_reported(tmp_path: Path) -> None:
