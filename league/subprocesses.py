@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -19,6 +20,8 @@ from league.errors import LeagueError, WorkerLost, from_document, to_document
 
 POLL_INTERVAL = 0.1
 """Seconds between two checks whether a subprocess has exited."""
+END_TIMEOUT = 15.0
+"""Seconds after which a subprocess that answers requests ends without its cleanup."""
 
 
 class Subprocess:
@@ -200,10 +203,12 @@ class RequestProcess:
         return head, content
 
     def close(self) -> None:
-        """Kill it, also during a request."""
+        """End it, also during a request. It may clean up for END_TIMEOUT seconds."""
         with self._lock:
             self._is_closed = True
-        self._stop()
+            process, self._process = self._process, None
+        if process is not None:
+            process.terminate(END_TIMEOUT)
 
     def _stop(self) -> None:
         with self._lock:
@@ -212,39 +217,59 @@ class RequestProcess:
             process.stop()
 
 
-def answer_requests(respond: Callable[[bytes], tuple[Mapping[str, Any], bytes]]) -> None:
+class _EndOfRequests(BaseException):
+    """The parent has ended, or has no further requests. Not an Exception, which a response may catch."""
+
+
+def answer_requests(
+    respond: Callable[[bytes], tuple[Mapping[str, Any], bytes]], cleanup: Callable[[], None] = lambda: None
+) -> None:
     """Answer the requests of a `RequestProcess` in this subprocess until the parent ends, also during a response.
 
     It writes `{}` when it is ready. Each line of standard input is a request. Responses follow in order: a JSON object
     in a line, with `size`, and so many bytes.
 
     respond: returns the object and the bytes. A LeagueError is a response, too; other exceptions are bugs, which end
-    the process.
+    the process. cleanup: called at the end. If it does not return within END_TIMEOUT seconds, the process ends.
     """
     requests: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    main = threading.get_ident()
+
+    def end(*_: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # nothing interrupts the cleanup
+        raise _EndOfRequests
 
     def read() -> None:
         for line in sys.stdin.buffer:
             requests.put(line)
+        signal.pthread_kill(main, signal.SIGTERM)
+        time.sleep(END_TIMEOUT)
         os._exit(0)
 
+    signal.signal(signal.SIGTERM, end)
     responses = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # output of environments must not mix with responses
     threading.Thread(target=read, name="requests", daemon=True).start()
     head: Mapping[str, Any] = {}
-    content = b""
+    content, code = b"", 0
     try:
-        while True:
-            responses.write(json.dumps(head).encode() + b"\n" + content)
-            responses.flush()
-            try:
-                head, content = respond(requests.get())
-            except LeagueError as error:
-                head, content = to_document(error), b""
-            head = {**head, "size": len(content)}
-    except BaseException:
-        traceback.print_exc()
-        os._exit(1)  # an exit would wait for the lock of standard input, which the other thread holds
+        try:
+            while True:
+                responses.write(json.dumps(head).encode() + b"\n" + content)
+                responses.flush()
+                try:
+                    head, content = respond(requests.get())
+                except LeagueError as error:
+                    head, content = to_document(error), b""
+                head = {**head, "size": len(content)}
+        except _EndOfRequests:
+            pass
+        except BaseException:
+            traceback.print_exc()
+            code = 1
+        cleanup()
+    finally:
+        os._exit(code)  # an exit would wait for the lock of standard input, which the other thread holds
 
 
 def exit_with_parent(cleanup: Callable[[], None] = lambda: None) -> None:

@@ -26,6 +26,7 @@ from ray.exceptions import RayError, RayTaskError
 from evaluation.documents import EvaluationReport, Listener, Progress, StoppedBy
 from evaluation.matches.game_records import forfeits_of_all, unique_games
 from evaluation.matches.leaderboard import by_side, rank_contestants
+from evaluation.matches.watchdog import CLOSE_SECONDS
 from evaluation.matches.worker import match_worker, num_envs
 from evaluation.schedules.builders import ANCHOR
 from evaluation.schedules.tournament_plan import (
@@ -40,6 +41,7 @@ from evaluation.schedules.tournament_plan import (
 )
 from evaluation.statistics.payoff import cross_play_table, tabulate
 from evaluation.statistics.population import population
+from league.config.league import LeagueConfig
 from league.environments import building
 from league.errors import InvalidInput, LeagueError, WorkerLost, one_line
 from league.policies.loading import baselines, check_anchors, check_eligible, check_plays, eligible, pinned
@@ -143,7 +145,7 @@ def play_schedule(
     document = config.model_dump_json(by_alias=True)
     places = _Places(workers)
     played = (
-        (match_worker(registry.storage, document).play(schedule, chunk) for chunk in chunks)
+        _in_this_process(schedule, chunks, registry.storage, document)
         if workers == 0 or not chunks
         else _in_ray(schedule, chunks, registry.storage, document, places)
     )
@@ -164,7 +166,7 @@ def play_schedule(
 
 
 def evaluate(
-    league: str,
+    league: str | LeagueConfig,
     refs: Sequence[str] = (),
     *,
     registry: Registry,
@@ -179,7 +181,7 @@ def evaluate(
     """Play a tournament of `refs` and the scripted baselines, or cross-play of `refs` in one team.
 
     Args:
-        league: The league.
+        league: The league, or its configuration, which is registered.
         refs: Versions, aliases (resolved now) and scripts. By default all versions trained in the current environment.
         registry: Registry of the league.
         schedule: `round_robin`: every pair plays `blocks` matches. `gauntlet`: each of `refs` plays each of `against`.
@@ -198,6 +200,9 @@ def evaluate(
         LeagueError: UnknownLeague, InterfaceChanged, UnknownVersion, UnknownAlias, UnknownPolicy, EnvironmentMismatch,
             and the errors of `play_schedule`.
     """
+    if isinstance(league, LeagueConfig):
+        registry.leagues.register(league, building.interface(league))
+        league = league.league
     row = registry.leagues.follow_code(league, building.interface)
     _check_options(schedule, against, budget)
     check_anchors(row.config, registry)
@@ -354,6 +359,20 @@ class _Places:
             self.nodes, self.cpus = len(used), min(self.at_once, int(sum(cpus[node_id] for node_id in used)))
 
 
+def _in_this_process(
+    schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str
+) -> Generator[list[Match]]:
+    """The chunks in order."""
+    if not chunks:
+        return
+    worker = match_worker(storage, config)
+    try:
+        for chunk in chunks:
+            yield worker.play(schedule, chunk)
+    finally:
+        worker.close_environment()
+
+
 def _in_ray(
     schedule: Schedule, chunks: Sequence[range], storage: Storage, config: str, places: _Places
 ) -> Generator[list[Match]]:
@@ -369,27 +388,38 @@ def _in_ray(
     flying: dict[ray.ObjectRef, int] = {}
     done: ReorderBuffer[list[Match]] = ReorderBuffer()
     nodes, latest = node_ids(), monotonic()
-    while done.due < len(chunks):
-        places.count(storage)
-        room = max(0, places.at_once - len(flying) - len(done))
-        flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, room)}
-        if (chunk := done.take()) is not None:
-            yield chunk
-            continue
-        finished, _ = ray.wait(list(flying), timeout=NODE_COUNT)
-        for ref in finished:
-            index = flying.pop(ref)
-            node, matches = _result(ref, schedule, chunks[index])
-            done.put(index, matches)
-            places.played(node)
-            latest = monotonic()
-        if monotonic() - latest >= NODE_CHECK:
-            latest = monotonic()
-            before, nodes = nodes, node_ids()
-            if before - nodes:
-                # Ray repeats a task of a machine that vanished once its connection has been silent for minutes. The
-                # matches of a chunk are the same wherever and however often they are played.
-                flying = {_play_chunk.remote(job, chunks[index]): index for index in flying.values()}
+    try:
+        while done.due < len(chunks):
+            places.count(storage)
+            room = max(0, places.at_once - len(flying) - len(done))
+            flying |= {_play_chunk.remote(job, chunk): index for index, chunk in islice(waiting, room)}
+            if (chunk := done.take()) is not None:
+                yield chunk
+                continue
+            finished, _ = ray.wait(list(flying), timeout=NODE_COUNT)
+            for ref in finished:
+                index = flying.pop(ref)
+                node, matches = _result(ref, schedule, chunks[index])
+                done.put(index, matches)
+                places.played(node)
+                latest = monotonic()
+            if monotonic() - latest >= NODE_CHECK:
+                latest = monotonic()
+                before, nodes = nodes, node_ids()
+                if before - nodes:
+                    # Ray repeats a task of a machine that vanished once its connection has been silent for minutes. The
+                    # matches of a chunk are the same wherever and however often they are played.
+                    flying = {_play_chunk.remote(job, chunks[index]): index for index in flying.values()}
+    finally:
+        _cancel(list(flying))
+
+
+def _cancel(tasks: list[ray.ObjectRef]) -> None:
+    """Interrupt chunks that are not needed, and wait until they have closed their environments."""
+    for task in tasks:
+        ray.cancel(task)
+    if tasks:
+        ray.wait(tasks, num_returns=len(tasks), timeout=CLOSE_SECONDS)
 
 
 @ray.remote(num_cpus=1, max_retries=RETRIES)  # type: ignore[untyped-decorator]
@@ -397,7 +427,11 @@ def _play_chunk(job: tuple[Schedule, Storage, str, dict[str, str]], chunk: range
     """The id of the node that played, and the matches."""
     schedule, storage, config, stack = job
     check_stack(stack, "of the driver")  # this node may have joined the cluster later
-    matches = match_worker(storage, config).play(schedule, chunk, expendable=True)
+    worker = match_worker(storage, config)
+    try:
+        matches = worker.play(schedule, chunk, expendable=True)
+    finally:
+        worker.close_environment(expendable=True)  # Ray does not tell its processes that they end
     return ray.get_runtime_context().get_node_id(), matches
 
 

@@ -9,10 +9,11 @@ from types import MappingProxyType
 
 from evaluation.matches.game_loop import play_matches
 from evaluation.matches.seating import Roster
-from evaluation.matches.watchdog import Deadline
+from evaluation.matches.watchdog import Deadline, close_in_time
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation, stepping
+from league.environments.lockstep import Lockstep
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch
 from league.policies.loading import check_eligible
@@ -33,7 +34,10 @@ _workers: OrderedDict[tuple[Storage, str], MatchWorker] = OrderedDict()
 
 
 class MatchWorker:
-    """Plays matches of one league. Not thread-safe."""
+    """Plays matches of one league. Not thread-safe.
+
+    Its environment is created for the first matches, and closed at the end of a schedule by whoever plays it.
+    """
 
     def __init__(self, config: LeagueConfig, registry: Registry) -> None:
         self.config = config
@@ -74,27 +78,33 @@ class MatchWorker:
         seated = self.interface.apart() if schedule.scoring == "team" else self.interface
         settings = self.config.play
         deadline = Deadline(settings.game_seconds, expendable)
-        environment = self._environment or stepping(
+        environment = self._environment = self._environment or stepping(
             self.config.environment,
             num_envs(self.config),
             simulators=ForSimulators(self._registry.storage, self.config.league),
         )
-        # An interrupted environment is neither reused nor closed, because closing may hang, except for a gateway.
-        self._environment = None
         try:
-            matches = play_matches(
+            return play_matches(
                 schedule, positions, environment, seated, roster, settings.max_moves, deadline, mixtures
             )
-            self._environment = environment
-        finally:
-            if self._environment is None and self.config.environment.external is not None:
-                environment.close()
-        return matches
+        except BaseException:
+            self._discard_environment(expendable)  # it must not be used again
+            raise
+
+    def close_environment(self, expendable: bool = False) -> None:
+        """Close the environment, and create another one for the next matches. expendable: see `play`."""
+        # A vectorised one has nothing to close, and simulators stay connected.
+        if isinstance(self._environment, Lockstep):
+            self._discard_environment(expendable)
+
+    def _discard_environment(self, expendable: bool) -> None:
+        environment, self._environment = self._environment, None
+        if environment is not None:
+            close_in_time(environment, expendable)
 
     def close(self) -> None:
-        """Close the connections to the registry, and those of simulators."""
-        if self._environment is not None and self.config.environment.external is not None:
-            self._environment.close()
+        """Close the environment and the connections to the registry."""
+        self._discard_environment(expendable=False)
         self._registry.close()
 
     def _mixture(self, ref: str) -> Mixture | None:

@@ -219,11 +219,11 @@ def write_video(
     if out.suffix.lower() not in FORMATS:
         raise ConfigError(f"--out {out}: expected a name that ends in {' or '.join(FORMATS)}")
     _require(source, "rgb_array")
-    environment = stock_stepping(source.config.environment, 1, render_mode="rgb_array")
     shades = environment_hooks(source.config.environment).declared.agent_colors
     captions = Captions(source.title, source.interface, source.controllers, shades)
     frames, turns, last = None, True, None
-    with closing(environment), tempfile.TemporaryFile() as spool:
+    stepping = stock_stepping(source.config.environment, 1, render_mode="rgb_array")
+    with closing(stepping) as environment, tempfile.TemporaryFile() as spool:
         with AppendingTiffWriter(spool) as writer:
             for last in islice(source.play(environment), max_frames):
                 picture, caption = environment.render(0), captions.of(last)
@@ -249,9 +249,8 @@ def show_window(source: GameSource, fps: float | None = None, listener: CaptionL
             "--watch needs a display, but DISPLAY and WAYLAND_DISPLAY are not set: use --out game.gif"
         )
     _require(source, "human")
-    environment = stock_stepping(source.config.environment, 1, render_mode="human")
     captions, last = Captions(source.title, source.interface, source.controllers), None
-    with closing(environment):
+    with closing(stock_stepping(source.config.environment, 1, render_mode="human")) as environment:
         for last in source.play(environment):
             if listener:
                 listener(captions.of(last))
@@ -263,9 +262,8 @@ def show_window(source: GameSource, fps: float | None = None, listener: CaptionL
 
 def render_modes(config: EnvironmentConfig) -> list[str]:
     """Render modes that the environment declares."""
-    environment = build(config)
-    metadata = getattr(environment, "metadata", None) or {}
-    environment.close()
+    with closing(build(config)) as environment:
+        metadata = getattr(environment, "metadata", None) or {}
     return [str(mode) for mode in metadata.get("render_modes") or ()]
 
 

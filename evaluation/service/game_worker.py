@@ -22,7 +22,7 @@ from pathlib import Path
 import orjson
 from pydantic import BaseModel
 
-from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
+from evaluation.matches.watchdog import Deadline, GameTimeout, close_in_time, enforce_deadline
 from evaluation.matches.worker import MatchWorker
 from evaluation.playback.environment_hooks import EnvironmentHooks, environment_hooks
 from evaluation.playback.human_play import human_play, playability
@@ -57,7 +57,7 @@ class GameWorker:
         self._stage: tuple[BatchedEnvironment, EnvironmentHooks] | None = None
 
     def respond(self, operation: GameOperation) -> GameResponse:
-        """Perform an operation. Raises LeagueError. An environment in an undefined state is discarded."""
+        """Perform an operation. Raises LeagueError. An environment in an undefined state is closed."""
         matches, environment, hooks = self._ready()
         match operation:
             case PlayabilityRequest():
@@ -70,7 +70,7 @@ class GameWorker:
                 source = recorded_game(operation.match, operation.game, self._registry, chances=True, request=operation)
                 recording = recorded_steps(source, record, operation, environment, hooks.draws)
                 if recording.fault is not None:
-                    self.discard_environment()
+                    self.close()
                 return _json(recording)
             case HumanPlayRequest():
                 opponent = acting_ref(operation.opponent, self._registry, f"game {operation.seed}")
@@ -85,19 +85,22 @@ class GameWorker:
                 try:
                     return _json(human_play(operation, config, interface, policies, analyst, environment, hooks))
                 except GameCrashed:
-                    self.discard_environment()
+                    self.close()
                     raise
 
-    def discard_environment(self) -> None:
-        """Drop the environment without calling it again."""
-        self._stage = None
+    def close(self) -> None:
+        """Close the environment. The next operation creates another one."""
+        stage, self._stage = self._stage, None
+        if stage is not None:
+            close_in_time(stage[0])
 
     def _ready(self) -> tuple[MatchWorker, BatchedEnvironment, EnvironmentHooks]:
         """Load the current configuration of the league and create its environment."""
         config = self._registry.leagues.get(self._league).config
         try:
             if self._matches is None or self._matches.config != config:
-                self._matches, self._stage = MatchWorker(config, self._registry), None
+                self.close()
+                self._matches = MatchWorker(config, self._registry)
             if self._stage is None:
                 hooks = environment_hooks(config.environment)
                 render_mode = "rgb_array" if hooks.draws else None
@@ -133,7 +136,7 @@ def _within(worker: GameWorker, request: GameRequest, seconds: float) -> GameRes
         with enforce_deadline(check, Deadline(seconds, expendable=True)):
             return worker.respond(request.operation)
     except GameTimeout as exceeded:
-        worker.discard_environment()
+        worker.close()
         raise exceeded.error from None
 
 
@@ -152,7 +155,7 @@ def main() -> None:
             response = _within(worker, GameRequest.model_validate_json(request), options["seconds"])
             return {"media_type": response.media_type}, response.content
 
-        answer_requests(respond)
+        answer_requests(respond, worker.close)
 
 
 if __name__ == "__main__":

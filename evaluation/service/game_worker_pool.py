@@ -82,7 +82,7 @@ class GameWorkerPool:
             raise
 
     def close(self) -> None:
-        """Kill all processes."""
+        """End all processes."""
         while self._workers:
             self._workers.popitem()[1].close()
 
@@ -92,7 +92,7 @@ class GameWorkerPool:
                 idle = next((other for other, worker in self._workers.items() if not worker.is_busy), None)
                 if idle is None:
                     raise Overloaded(f"all {self._most} processes for games are in use by other leagues: retry soon")
-                self._workers.pop(idle).close()
+                self._workers.pop(idle).retire()
             self._workers[league] = _LeagueWorker(league, self._seconds, self._grace)
         self._workers.move_to_end(league)
         return self._workers[league]
@@ -135,8 +135,13 @@ class _LeagueWorker:
         self._pending.append(self._thread.submit(self._request, line))
         return self._pending[-1]
 
+    def retire(self) -> None:
+        """End the idle process in its thread, as its environment may take long to close."""
+        self._thread.submit(self._process.close)
+        self._thread.shutdown(wait=False)
+
     def close(self) -> None:
-        """Kill the process."""
+        """End the process."""
         self._thread.shutdown(wait=False, cancel_futures=True)
         self._process.close()
 

@@ -134,6 +134,8 @@ def measured(registry: Registry, worker: MatchWorker, request: Mapping[str, Any]
         raise
     except Exception as error:  # of an environment or a bot: training goes on
         raise LeagueError(one_line(error, with_type=True)) from error
+    finally:
+        worker.close_environment()  # the next measurement may be hours away
     return {"rows": [asdict(row) | {"at": row.at.isoformat()} for row in rows]}
 
 

@@ -47,8 +47,8 @@ class LeagueConfig(Part):
     folder: str | None = None
     """Folder in which entry points are searched first, relative to the file; by default the folder of the file."""
     policies: dict[str, tuple[str, ...]] | str | None = None
-    """Policy id → agents, by name or pattern (`player_*`); the first match determines an agent's policy. Alternatively
-    a function `package.module:function` from agent to policy id. By default agents with equal spaces share a policy."""
+    """Policy id → agents, by name, else by the first pattern (`player_*`) that matches. Alternatively a function
+    `package.module:function` from agent to policy id. By default agents with equal spaces share a policy."""
     sides: dict[str, tuple[str, ...]] | None = None
     """Side → agents, by name or pattern. By default each agent is a separate side."""
     play: PlayConfig = PlayConfig()

@@ -2,11 +2,14 @@
 
 import copy
 import fnmatch
+import logging
 import os
 import re
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from functools import cache
 from inspect import signature
+from itertools import chain
 from typing import Any
 
 import gymnasium
@@ -34,6 +37,8 @@ from league.interface import AgentInterface, Interface
 from league.refs import check_slug
 from league.spaces import Discrete, MultiDiscrete
 from league.spaces.conversion import from_gymnasium, with_mask
+
+logger = logging.getLogger(__name__)
 
 
 class Cycle(aec_to_parallel_wrapper):
@@ -85,7 +90,8 @@ AMENDMENTS = (with_drawing, with_whole_reset, with_reseeding, with_one_copy)
 def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
     """Build an environment: a PettingZoo AECEnv or ParallelEnv, or an `RLlibEnv`. Its agents are strings.
 
-    That of a game that runs in simulators has spaces only.
+    That of a game that runs in simulators has spaces only. The caller closes it. What `close` raises is logged and
+    returned.
 
     Raises ConfigError if it cannot be imported, constructed or wrapped.
     """
@@ -113,14 +119,44 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
             f"environment.entry_point: {config.entry_point} returned a {type(env).__name__}, expected {expected}"
         )
     env = with_api(_without_checks(env), api)
-    for amend in AMENDMENTS:
-        env = amend(env)
-    if config.wrappers and api == "rllib":
-        raise ConfigError(
-            f"environment.wrappers: {config.wrappers[0].name} (number 1): SuperSuit supports only PettingZoo"
-            " environments; for an RLlib environment, transform observations in its own code"
-        )
-    return with_info_masks(with_cycles(wrapped(env, config.wrappers)), f"{config.model_dump_json()}{config.folder}")
+    try:
+        for amend in AMENDMENTS:
+            env = amend(env)
+        if config.wrappers and api == "rllib":
+            raise ConfigError(
+                f"environment.wrappers: {config.wrappers[0].name} (number 1): SuperSuit supports only PettingZoo"
+                " environments; for an RLlib environment, transform observations in its own code"
+            )
+        env = with_cycles(wrapped(env, config.wrappers))
+        return with_safe_close(with_info_masks(env, f"{config.model_dump_json()}{config.folder}"))
+    except BaseException:
+        with_safe_close(env).close()
+        raise
+
+
+def with_safe_close(env: Any) -> Any:
+    """Let `close` log and return an exception instead of raising it: it must neither hide an earlier error, nor keep
+    other environments open, nor end the process. Returns `env`.
+    """
+    close = env.close
+
+    def safe_close() -> Exception | None:
+        try:
+            with no_exit:
+                close()
+        except Exception as error:
+            _log_once(f"The environment's close raised an exception{cause(error)}")
+            return error
+        return None
+
+    env.close = safe_close
+    return env
+
+
+@cache
+def _log_once(text: str) -> None:
+    """Log a warning that is the same for all copies of an environment."""
+    logger.warning(text)
 
 
 def _refuses_arguments(constructor: Callable[..., Any], kwargs: Mapping[str, Any], error: Exception) -> bool:
@@ -303,15 +339,17 @@ def _is_slug(name: str) -> bool:
 
 
 def divide(key: str, groups: dict[str, tuple[str, ...]], agents: list[str]) -> dict[str, str]:
-    """Return agent → the first group with a matching pattern."""
+    """Return agent → the group that names it, else the first group with a matching pattern."""
     of_agent = {}
     for agent in agents:
+        # As a pattern, a name such as drone[3] matches another agent.
+        naming = (group for group, patterns in groups.items() if agent in patterns)
         fitting = (
             group
             for group, patterns in groups.items()
             if any(fnmatch.fnmatchcase(agent, pattern) for pattern in patterns)
         )
-        if (group := next(fitting, None)) is None:
+        if (group := next(chain(naming, fitting), None)) is None:
             raise ConfigError(f"{key}: agent {agent!r} matches none of {', '.join(groups)}")
         of_agent[agent] = group
     for group in groups:

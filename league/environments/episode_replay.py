@@ -1,6 +1,5 @@
 """The actions of episodes in progress, and their replay in the stock environment."""
 
-import contextlib
 from collections import deque
 from itertools import islice
 from typing import Any, NamedTuple
@@ -60,9 +59,9 @@ class EpisodeActions:
         further: a step after the recorded ones.
         """
         stock = build(config, render_mode)
-        interfaces = [agent_interface(stock, agent) for agent in stock.possible_agents]
-        adapter = adapter_for(stock, [splitter(spaces.observation) for spaces in interfaces])
         try:
+            interfaces = [agent_interface(stock, agent) for agent in stock.possible_agents]
+            adapter = adapter_for(stock, [splitter(spaces.observation) for spaces in interfaces])
             with no_exit:
                 adapter.reset(int(self._seeds[env]))
                 for step in (*self._since(int(self._began[env])), *(() if further is None else (further,))):
@@ -71,8 +70,7 @@ class EpisodeActions:
                     actions = environment_actions(step.actions[rows], interfaces[0].action)
                     adapter.step(list(zip(step.agents[rows].tolist(), actions, strict=True)))
         except BaseException:
-            with contextlib.suppress(Exception), no_exit:
-                adapter.close()
+            stock.close()
             raise
         return adapter
 

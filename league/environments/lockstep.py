@@ -1,9 +1,9 @@
 """Steps n environments of any API in lockstep and batches their observations."""
 
-import contextlib
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from operator import itemgetter
 from time import perf_counter
 from typing import Any, TypeVar
@@ -90,14 +90,16 @@ class Lockstep(EpisodeStepping):
     ) -> None:
         """make_of_seed: makes the environment of each episode from its seed; by default all are alike."""
         self._make, self._make_of_seed, self._gives_states = make, make_of_seed, states
-        envs = [make() for _ in range(num_envs)]
-        super().__init__(envs[0].possible_agents, num_envs, crashes)
-        interfaces = [agent_interface(envs[0], agent) for agent in self.agents]
-        self._splits = [splitter(spaces.observation) for spaces in interfaces]
-        self._inputs = [inputs(spaces.observation) for spaces in interfaces]
-        self._first_alike = [self._inputs.index(leaves) for leaves in self._inputs]
-        self._actions = [spaces.action for spaces in interfaces]
-        self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
+        with ExitStack() as created:
+            envs = [created.enter_context(closing(make())) for _ in range(num_envs)]
+            super().__init__(envs[0].possible_agents, num_envs, crashes)
+            interfaces = [agent_interface(envs[0], agent) for agent in self.agents]
+            self._splits = [splitter(spaces.observation) for spaces in interfaces]
+            self._inputs = [inputs(spaces.observation) for spaces in interfaces]
+            self._first_alike = [self._inputs.index(leaves) for leaves in self._inputs]
+            self._actions = [spaces.action for spaces in interfaces]
+            self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
+            created.pop_all()
         self._seeds = np.zeros(num_envs, np.int64)
         self._busy: int | None = None
 
@@ -154,9 +156,9 @@ class Lockstep(EpisodeStepping):
             return picture(self._envs[env].render(agent))
 
     def close(self) -> None:
-        with no_exit:
-            for env in self._envs:
-                env.close()
+        # The one that was interrupted may hang again.
+        for env in sorted(range(self.num_envs), key=lambda env: env == self._busy):
+            self._envs[env].close()
 
     def _timed(self, env: int, call: Callable[[Given], list[Report]], given: Given) -> list[Report]:
         self._since = perf_counter()
@@ -218,8 +220,7 @@ class Lockstep(EpisodeStepping):
         """Recreate an environment, or raise the error after too many crashes."""
         self._crashes.count(env, int(self._seeds[env]), error)
         self._busy = None
-        with contextlib.suppress(Exception), no_exit:
-            self._envs[env].close()
+        self._envs[env].close()
         self._envs[env] = adapter_for(self._make(), self._splits)
 
     def _batches(self, rows: Sequence[tuple[int, Report]]) -> dict[int, Batch]:

@@ -211,7 +211,7 @@ class BatchedEnvironment(Protocol):
         """
 
     def close(self) -> None:
-        """Close the environments."""
+        """Close the environments. An environment that hangs is the last one. What they raise is logged."""
 
 
 class EpisodeStepping:

@@ -95,9 +95,8 @@ def _play(config: "LeagueConfig", url: str) -> None:
     first, second = interface.agents
     spaces = interface.agents[second]
     opponent = script(ScriptRef.parse(OPPONENT).name, spaces.observation, spaces.action)
-    environment = stock_stepping(config.environment, num_envs=1)
     (champion,) = remote_policies(RemoteRef(url, config.league), interface).values()
-    with closing(environment), closing(champion):
+    with closing(champion), closing(stock_stepping(config.environment, num_envs=1)) as environment:
         steps = list(play_game(environment, {first: champion, second: opponent}, seed=config.training.seed))
     moves = [move for step in steps for move in step.moves]
     board = next(drawing(e.observation["observation"]) for e in steps[-1].endings if e.agent == 0)

@@ -3,16 +3,19 @@
 import queue
 import shutil
 import threading
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
+from league.errors import LeagueError
 from league.interface import Interface
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from training.export.publish import Checkpoint, publish
 from training.runs.checkpoint_digests import private_copy
+from training.runs.error_messages import training_error
 from training.runs.run_directory import RunDirectory
 
 
@@ -33,7 +36,7 @@ class PublishQueue:
         self._queue: queue.Queue[Path] = queue.Queue()
         self._thread = threading.Thread(target=self._work, name="publisher", daemon=True)
         self._thread.start()
-        self.error: BaseException | None = None
+        self.error: LeagueError | None = None
         """The error that stopped publishing."""
 
     def add(self, checkpoint: Path) -> None:
@@ -53,8 +56,12 @@ class PublishQueue:
             try:
                 if self.error is None:
                     self._publish(checkpoint)
-            except BaseException as error:
+            except LeagueError as error:
                 self.error = error
+            except BaseException as error:  # of the environment, which plays before a version is published
+                trace = self._run.path / "error.txt"
+                trace.write_text("".join(traceback.format_exception(error)))
+                self.error = training_error(error, self._run.record.config.league, trace)
             finally:
                 self._queue.task_done()
 

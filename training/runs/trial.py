@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections import Counter
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -102,16 +102,28 @@ class Trial(tune.Trainable):
     """
 
     def setup(self, config: dict[str, Any]) -> None:
+        self.plan: TrialPlan = config["plan"]
+        self._opened = ExitStack()
+        self._fault: Exception | None = None
+        try:
+            self._begin(config)
+        except Exception as error:
+            self._fault = error
+
+    def _begin(self, config: dict[str, Any]) -> None:
         self.league = with_algorithm(LeagueConfig.model_validate(config["league"]))
         self.interface = Interface.model_validate(config["interface"])
-        self.plan: TrialPlan = config["plan"]
         self.files = DriverFiles() if self.plan.driver is None else self.plan.driver.files()
+        self._opened.callback(self.files.close)
         self.has_callbacks = bool(self.league.training.callbacks) and self.plan.run is not None
         is_external = self.league.environment.external is not None
         self.registry = Registry.open(self.plan.storage, create=False) if is_external else None
+        if self.registry is not None:
+            self._opened.callback(self.registry.close)
         start = self.plan.start
         checkpoint = None if start.checkpoint is None else self.files.fetch(start.checkpoint)
         self.algorithm = build_algorithm(self.league, self.interface, checkpoint, self.plan.cpus, self.plan.storage)
+        self._opened.callback(self.algorithm.stop)
         if start.steps == start.steps_before_run:
             self.algorithm.opponents.refresh(parent=self.plan.parent)
             self.algorithm.curriculum.restart(start.steps)
@@ -129,7 +141,11 @@ class Trial(tune.Trainable):
         self._plan_checkpoint()
 
     def step(self) -> dict[str, Any]:
-        """Update until a report is due; return the latest value of each metric."""
+        """Update until a report is due; return the latest value of each metric. Raises what `setup` has raised, too: of
+        an exception of a constructor, Ray keeps the text only.
+        """
+        if self._fault is not None:
+            raise self._fault
         metrics: dict[str, Any] = {}
         sums: Counter[str] = Counter()
         updates, episodes = list[dict[str, float]](), list[PlayedEpisodes]()
@@ -180,10 +196,7 @@ class Trial(tune.Trainable):
         return {"steps": self.steps - self.plan.start.steps_before_run, "seconds": self.seconds}
 
     def cleanup(self) -> None:
-        self.algorithm.stop()
-        self.files.close()
-        if self.registry is not None:
-            self.registry.close()
+        self._opened.close()
 
     def _due(self) -> bool:
         reached = self.steps >= self.next_steps or self.seconds >= self.next_seconds

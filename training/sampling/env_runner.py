@@ -88,11 +88,15 @@ class BatchedEnvRunner(RaisingEnvRunner):
         self._samples = self.worker_index > 0 or not self.config.num_env_runners
         self.make_module()
         if self._samples:
-            self.make_env()
-            settings = self.league.training
-            if isinstance(settings, PPOConfig) and settings.teacher is not None:
-                storage = self.config.env_config.get(STORAGE)
-                self._teacher = Teacher(settings.teacher, self.interface, storage, settings.seed)
+            try:
+                self.make_env()
+                settings = self.league.training
+                if isinstance(settings, PPOConfig) and settings.teacher is not None:
+                    storage = self.config.env_config.get(STORAGE)
+                    self._teacher = Teacher(settings.teacher, self.interface, storage, settings.seed)
+            except BaseException:
+                self.stop()
+                raise
 
     def make_env(self) -> None:
         """Create the environments, after closing previous ones."""

@@ -2,8 +2,10 @@
 
 import math
 import random
+import threading
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +23,7 @@ from league.environments.conformance.observations import ObservationCheck, check
 from league.environments.conformance.openings import joined, measure_openings
 from league.environments.conformance.random_actions import RandomActions
 from league.environments.conformance.time_budget import TimeBudget
-from league.errors import EnvironmentMismatch, IllegalMask, no_exit, one_line
+from league.errors import EnvironmentMismatch, IllegalMask, LeagueError, no_exit, one_line, raised_at
 from league.interface import Interface
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import check_mask, mask_size
@@ -88,6 +90,7 @@ class Examiner:
             cut = "" if is_whole else f", the last one only to step {first[-1].steps}"
             budget.skipped.append(f"{len(first)} of {episodes} episodes were played{cut}")
         self._check_seeding(adapter, first, seed)
+        self._check_thread(first[0], seed)
         traces = [episode.trace for episode in first]
         check_constant_observations(traces, self._env, examination)
         if is_whole:
@@ -136,10 +139,33 @@ class Examiner:
             ) + "".join(f", and it draws from the generator of the module {name}" for name in drawn)
         self._found.add("fault", text, example=change)
 
-    def _anew(self, episode: PlayedEpisode, seed: int) -> PlayedEpisode:
-        """Play an episode in a new environment."""
+    def _anew(self, episode: PlayedEpisode, seed: int, share: float | None = None) -> PlayedEpisode:
+        """Play an episode in a new environment. share: see `_episode`."""
         with closing(adapter_for(build(self._config.environment), self._checks)) as fresh:
-            return self._episode(fresh, seed, "the first episode in a new environment", episode.steps)
+            return self._episode(fresh, seed, "the first episode in a new environment", episode.steps, share)
+
+    def _check_thread(self, episode: PlayedEpisode, seed: int) -> None:
+        """Play an episode, which a new environment has played here, outside of the main thread, as training does."""
+        outcome: Future[PlayedEpisode] = Future()
+
+        def play() -> None:
+            try:
+                outcome.set_result(self._anew(episode, seed, FIRST))
+            except BaseException as error:
+                outcome.set_exception(error)
+
+        threading.Thread(target=play, name="episode", daemon=True).start()
+        try:
+            with no_exit:
+                outcome.result()
+        except Exception as error:
+            where = "".join(f"{line}, " for line in [raised_at(error)] if line)
+            self._found.add(
+                "fault",
+                "outside of the main thread, where training plays too, the environment raised an exception"
+                f" ({where}{self.place}): {one_line(error, with_type=not isinstance(error, LeagueError))}. Signals, for"
+                " example, work only in the main thread: limit times by timeouts of sockets, subprocesses or threads",
+            )
 
     def _change(self, one: PlayedEpisode, other: PlayedEpisode) -> str:
         """Describe the first report that differs between two episodes; empty if they are equal."""

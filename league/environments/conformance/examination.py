@@ -7,6 +7,7 @@ import contextlib
 import io
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
@@ -64,13 +65,47 @@ def examine(
         with no_exit:
             examination.implementation = implementation(config.environment).reason
             env = build(config.environment)
-            interface = describe(env, config)
     except LeagueError as error:
         examination.add("fault", str(error))
         return examination
     except Exception as error:
         examination.add("fault", f"{config.environment.entry_point} cannot be created{cause(error)}")
         return examination
+    try:
+        interface = _described(env, config, examination)
+        if interface is not None and config.environment.external is None:
+            _play(env, interface, config, examination, budget, episodes, steps, seed)
+    finally:
+        error_of_close = env.close()
+    if error_of_close is not None:
+        fault = "`close` raised an exception, and may leave behind what the environment has started"
+        examination.add("note", f"{fault}{cause(error_of_close)}")
+    if interface is None or config.environment.external is not None:
+        return examination
+    if examination.passed:
+        _run_pettingzoo_tests(config.environment, examination, budget)
+    if examination.passed:
+        _compare_vectorised(config.environment, interface, examination, seed)
+    if budget.skipped:
+        examination.add(
+            "note",
+            f"the checks were cut short after {seconds:.0f} s, because the environment takes"
+            f" {1 / examination.steps_per_second:.2g} s per step: {', '.join(budget.skipped)} (--seconds)",
+        )
+    return examination
+
+
+def _described(env: Any, config: LeagueConfig, examination: Examination) -> Interface | None:
+    """Record the interface of an environment. Returns it if episodes can be played, else None."""
+    try:
+        with no_exit:
+            interface = describe(env, config)
+    except LeagueError as error:
+        examination.add("fault", str(error))
+        return None
+    except Exception as error:
+        examination.add("fault", f"{config.environment.entry_point} cannot be described{cause(error)}")
+        return None
     examination.api = (
         "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"
     )
@@ -85,9 +120,20 @@ def examine(
                 "fault", "has an unsupported action space: expected Discrete, MultiDiscrete or a Box of floats", agent
             )
     examination.interface = interface
-    if not examination.passed or config.environment.external is not None:
-        env.close()
-        return examination
+    return interface if examination.passed else None
+
+
+def _play(
+    env: Any,
+    interface: Interface,
+    config: LeagueConfig,
+    examination: Examination,
+    budget: TimeBudget,
+    episodes: int,
+    steps: int | None,
+    seed: int,
+) -> None:
+    """Play and check episodes. See `examine`."""
     examiner = Examiner(env, interface, config, examination, steps, budget)
     try:
         with no_exit:
@@ -98,19 +144,6 @@ def examine(
         examination.add("fault", str(error))
     except Exception as error:
         examination.add("fault", _explained(error, config, seed, str(examiner.place)))
-    finally:
-        env.close()
-    if examination.passed:
-        _run_pettingzoo_tests(config.environment, examination, budget)
-    if examination.passed:
-        _compare_vectorised(config.environment, interface, examination, seed)
-    if budget.skipped:
-        examination.add(
-            "note",
-            f"the checks were cut short after {seconds:.0f} s, because the environment takes"
-            f" {1 / examination.steps_per_second:.2g} s per step: {', '.join(budget.skipped)} (--seconds)",
-        )
-    return examination
 
 
 def _explained(error: Exception, config: LeagueConfig, seed: int, place: str) -> str:

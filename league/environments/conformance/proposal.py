@@ -4,6 +4,7 @@ The environment is built and played as by `league check-env`. Its agents and spa
 and algorithm; the openings are those that were measured.
 """
 
+import glob
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -235,7 +236,7 @@ def _patterns(own: list[str], agents: list[str]) -> list[str]:
         return ["*"]
     stem = own[0].rstrip("0123456789")
     if len(own) > LISTED_AGENTS and [agent for agent in agents if agent.startswith(stem)] == own:
-        return [f"{stem}*"]
+        return [f"{glob.escape(stem)}*"]
     return own
 
 

@@ -5,6 +5,7 @@ Everything that the two report must be equal bit for bit.
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
@@ -120,10 +121,12 @@ class DifferentialTest:
 
     def __init__(self, config: EnvironmentConfig, vector: VectorEnv) -> None:
         self._vector, self.num_envs = vector, vector.num_envs
-        stock = [build(config) for _ in range(self.num_envs)]
-        self._agents = _agents(stock[0])
-        splits = [partial(tensors, agent.observation) for agent in self._agents]
-        self._stock = [adapter_for(env, splits) for env in stock]
+        with ExitStack() as created:
+            stock = [created.enter_context(closing(build(config))) for _ in range(self.num_envs)]
+            self._agents = _agents(stock[0])
+            splits = [partial(tensors, agent.observation) for agent in self._agents]
+            self._stock = [adapter_for(env, splits) for env in stock]
+            created.pop_all()
         self._seeds, self._steps = np.zeros((2, self.num_envs), dtype=np.int64)
         self._must_act = np.zeros((self.num_envs, len(self._agents)), dtype=bool)
         self._masks: dict[int, NDArray] = {}

@@ -26,7 +26,7 @@ from evaluation.matches import tournament, watchdog
 from evaluation.matches.game_loop import play_matches
 from evaluation.matches.leaderboard import compute_leaderboard
 from evaluation.matches.tournament import ReorderBuffer, chunks_of, evaluate, play_schedule
-from evaluation.matches.watchdog import Deadline, GameTimeout, enforce_deadline
+from evaluation.matches.watchdog import Deadline
 from evaluation.matches.worker import MOST_WORKERS, MatchWorker, match_worker
 from evaluation.playback.replay import recorded_game
 from evaluation.schedules.builders import ANCHOR, round_robin
@@ -53,7 +53,7 @@ from league.registry.registry import Registry
 from league.results.ledger import Ledger
 from league.results.records import Match, Schedule
 from league.settings import Storage
-from tests.support.environments.fuses import ACTIONS, LIGHT, Fuse, fuse
+from tests.support.environments.fuses import ACTIONS, LIGHT, Fuse
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import promote, reconfigure
 from tests.support.leagues.registries import config, registered
@@ -557,11 +557,11 @@ def schedule_of(registry: Registry, *refs: str) -> Schedule:
 def test_a_hanging_environment_is_interrupted_and_replaced(tmp_path: Path, ends: str, where: str) -> None:
     settings = fuse_league(ends, where)
     registry = league(tmp_path, settings, 1, LIGHT, 2)
-    worker, handler_before = MatchWorker(settings, registry), signal.getsignal(signal.SIGALRM)
+    worker, handler_before = MatchWorker(settings, registry), signal.getsignal(watchdog.TICK)
     with pytest.raises(GameHung, match=r"of fuse@1 and fuse@2 \(game [01] of match fuse-.*/[0-3]\) .* 60 s"):
         worker.play(schedule_of(registry, "fuse@1", "fuse@2"), range(4))
     assert len(worker.play(schedule_of(registry, "fuse@1", "fuse@3"), range(4))) == 4
-    assert signal.getsignal(signal.SIGALRM) == handler_before
+    assert signal.getsignal(watchdog.TICK) == handler_before
 
 
 @pytest.mark.usefixtures("clock")
@@ -657,47 +657,3 @@ def test_a_hanging_game_in_a_worker_is_reported(tmp_path: Path) -> None:
         play_schedule(schedule_of(registry, "fuse@1", "fuse@2"), registry=registry, workers=2)
     schedule = schedule_of(registry, "fuse@1", "fuse@3")
     assert play_schedule(schedule, registry=registry, workers=2) == Ledger(registry).matches(league="fuse")
-
-
-STALLED = """
-import sys
-from evaluation.matches import watchdog
-from tests.support.environments.fuses import FAULTS
-
-watchdog.GRACE = 0.2
-with watchdog.enforce_deadline(lambda: None, watchdog.Deadline(0.2, expendable=True)):
-    FAULTS[sys.argv[1]]()
-"""
-
-
-def test_an_expendable_process_exits_if_signals_are_ignored() -> None:
-    command = [sys.executable, "-c", STALLED, "stalls"]
-    process = subprocess.run(
-        command, cwd=Path(__file__).parents[3], timeout=240, check=False, capture_output=True, text=True
-    )
-    assert process.returncode == 1
-    assert "in stalls" in process.stderr
-
-
-def test_an_existing_timer_is_restored() -> None:
-    """Such as the timeout of pytest."""
-    alarms: list[int] = []
-    handler = signal.signal(signal.SIGALRM, lambda *_: alarms.append(1))
-    previous = signal.setitimer(signal.ITIMER_REAL, 600)
-    try:
-        with enforce_deadline(lambda: None, Deadline(10)):
-            assert signal.getitimer(signal.ITIMER_REAL)[1] == 1.0
-        left, interval = signal.getitimer(signal.ITIMER_REAL)
-        assert (interval, alarms) == (0, [])
-        assert 300 < left <= 600
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, *previous)
-        signal.signal(signal.SIGALRM, handler)
-
-
-def test_an_exception_of_the_check_is_raised() -> None:
-    def check() -> None:
-        raise GameTimeout(GameHung("too long"))
-
-    with pytest.raises(GameTimeout, match="too long"), enforce_deadline(check, Deadline(0.05)):
-        fuse("waits")._fail()

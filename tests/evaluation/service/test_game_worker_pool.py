@@ -44,6 +44,7 @@ from league.service_requests import (
     RecordingRequest,
     VideoRequest,
 )
+from tests.support.environments.hanging import Raising
 from tests.support.leagues import tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.waiting import until
@@ -241,12 +242,26 @@ def test_a_process_that_dies_is_reported_and_replaced(pool: GameWorkerPool, monk
     assert document_of(submit(pool, play_request(opponent="script:random"), "dying"))["legal"]
 
 
-def test_an_exception_of_the_environment_is_reported_and_the_next_game_is_independent(registry: Registry) -> None:
+def test_an_exception_of_the_environment_is_reported_and_the_next_game_is_independent(
+    registry: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[Raising] = []
+    monkeypatch.setattr(Raising, "close", lambda environment: opened.remove(environment))
+    create = Raising.__init__
+
+    def open_(environment: Raising, **kwargs: Any) -> None:
+        create(environment, **kwargs)
+        opened.append(environment)
+
+    monkeypatch.setattr(Raising, "__init__", open_)
     worker = GameWorker("raising", registry)
     for _ in range(2):
         with pytest.raises(GameCrashed, match="the board is gone"):
             worker.respond(play_request(0, opponent="script:random"))
+        assert opened == [], "it is closed"
     assert document_of(worker.respond(play_request(opponent="script:random")))["legal"] == list(range(9))
+    worker.close()
+    assert opened == []
 
 
 def test_a_changed_environment_is_used_for_the_next_game(registry: Registry) -> None:
@@ -279,7 +294,8 @@ def test_idle_leagues_are_evicted_but_not_during_a_game(registry: Registry) -> N
                 await pool.submit(game_request(PlayabilityRequest()), 0.0)
             return process
 
-        assert not Path(f"/proc/{asyncio.run(submit_several())}").exists()
+        process = Path(f"/proc/{asyncio.run(submit_several())}")
+        until(lambda: not process.exists())
 
 
 def test_few_requests_may_wait(pool: GameWorkerPool, pause: threading.Event, monkeypatch: pytest.MonkeyPatch) -> None:

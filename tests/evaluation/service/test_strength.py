@@ -123,10 +123,17 @@ def test_a_process_plays_reports_errors_and_is_replaced(registry: Registry) -> N
 
 
 def test_an_exception_of_a_policy_is_a_response(registry: Registry) -> None:
+    """Its environment is closed, as after each measurement."""
+    closed: list[bool] = []
+
     class Broken(MatchWorker):
         def contestant(self, ref: str) -> dict:
             raise RuntimeError("no such layer")
 
+        def close_environment(self, expendable: bool = False) -> None:
+            closed.append(True)
+
     broken = Broken(registry.leagues.get(tictactoe.LEAGUE).config, registry)
     with pytest.raises(LeagueError, match=r"^RuntimeError: no such layer$"):
         measured(registry, broken, {"version": 2, "games": 4})
+    assert closed

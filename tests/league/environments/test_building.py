@@ -7,8 +7,9 @@ from pettingzoo import AECEnv, ParallelEnv
 
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
-from league.environments.building import Cycle, build, describe_policies, interface
+from league.environments.building import Cycle, build, describe_policies, divide, interface
 from league.errors import ConfigError, EnvironmentMismatch
+from tests.support.environments import engines
 
 COUNTING = "tests.support.environments.counting:counting"
 
@@ -35,6 +36,18 @@ def test_agents_are_matched_by_pattern_in_order() -> None:
     assert described.policies == {"player_0": "first", "player_1": "second", "player_2": "third"}
     assert described.sides == {"alone": ("player_1",), "team": ("player_0", "player_2")}
     assert described.policy_ids == ("first", "second", "third")
+
+
+def test_a_name_matches_before_any_pattern() -> None:
+    """Also if it is a pattern for other agents, or none for itself."""
+    names = ["drone[3]", "drone3", "drone[3]_0", "a*", "ab", "?"]
+    assert divide("sides", {name: (name,) for name in names}, names) == {name: name for name in names}
+    groups = {"all": ("*",), "third": ("drone[[]*", "drone3"), "odd": ("a*",)}
+    assert divide("policies", groups, ["drone[3]", "drone3", "a*"]) == {
+        "drone[3]": "all",
+        "drone3": "third",
+        "a*": "odd",
+    }
 
 
 def nameless() -> Any:
@@ -100,13 +113,19 @@ def test_an_environment_that_cannot_be_built_is_reported_with_its_key(subtests: 
         interface(league(f"{__name__}:nameless"))
 
 
+def test_an_environment_that_cannot_be_wrapped_is_closed() -> None:
+    with pytest.raises(ConfigError, match="no wrapper"):
+        build(league(f"{engines.__name__}:engine", environment={"wrappers": ["frame_stack_v9"]}).environment)
+    assert engines.RUNNING == []
+
+
 TICTACTOE, RPS, SPREAD = "pettingzoo.classic.tictactoe_v3", "pettingzoo.classic.rps_v2", "mpe2.simple_spread_v3"
 
 
 def test_mismatched_policies_sides_and_names_are_rejected(subtests: pytest.Subtests) -> None:
     for entry_point, changes, message in (
         (COUNTING, {"policies": {"a": ["player_0"]}}, "agent 'player_1' matches none of a"),
-        (COUNTING, {"policies": {"a": ["*"], "b": ["player_1"]}}, "policies.b: matches no agent"),
+        (COUNTING, {"policies": {"a": ["*"], "b": ["player_?"]}}, "policies.b: matches no agent"),
         (COUNTING, {"sides": {"a": ["player_9"]}}, "agent 'player_0' matches none"),
         (COUNTING, {"policies": {"a": ["*"]}}, "player_0 and player_1 have different spaces"),
         (RPS, {"policies": f"{__name__}:missing"}, "returned no valid policy id for agent 'player_1'"),

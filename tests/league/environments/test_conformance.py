@@ -2,6 +2,7 @@
 
 import random
 import re
+import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -152,6 +153,14 @@ class Shuffled(Simultaneous):
         return np.full(3, self.draw(), np.float32)
 
 
+class Signalling(Simultaneous):
+    """Limits the time of its steps by signals, as decorators do."""
+
+    def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
+        signal.signal(signal.SIGALRM, signal.getsignal(signal.SIGALRM))
+        return super().step(actions)
+
+
 class Endless(Simultaneous):
     """Its episodes do not end within 10,000 steps."""
 
@@ -237,6 +246,13 @@ FINDINGS: list[tuple[str, str | type, dict[str, Any], str]] = [
         MEETING,
         {"crashes": [0]},
         r"simultaneous.py, line \d+, step 2 of the episode with seed 0\): RuntimeError",
+    ),
+    (
+        "fault",
+        Signalling,
+        {},
+        r"^outside of the main thread, where training plays too, .* \(.*test_conformance.py, line \d+, step 1 of the"
+        r" episode with seed 0\): ValueError: signal only works in main thread.* limit times by timeouts",
     ),
     ("fault", ConstantImages, {}, "observes a constant image"),
     ("fault", DictActions, {}, "expected Discrete, MultiDiscrete or a Box of floats"),

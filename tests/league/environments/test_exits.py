@@ -1,5 +1,6 @@
 """An environment that ends the program, as games do when their window closes, raises an exception like any other."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,8 @@ pytestmark = pytest.mark.usefixtures("short_examinations")
 class Exiting(Simultaneous):
     """Ends the program in one of its methods."""
 
-    def __init__(self, where: str) -> None:
-        super().__init__()
+    def __init__(self, where: str, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
         self.where = where
         self._end("constructor")
 
@@ -41,6 +42,9 @@ class Exiting(Simultaneous):
         self._end("step")
         return super().step(actions)
 
+    def close(self) -> None:
+        self._end("close")
+
     def _end(self, where: str) -> None:
         if where == self.where:
             sys.exit(0)
@@ -52,7 +56,7 @@ class ExitingWrapper:
 
 
 def config(where: str, **environment: Any) -> LeagueConfig:
-    environment |= {"entry_point": f"{__name__}:Exiting", "kwargs": {"where": where}}
+    environment = {"entry_point": f"{__name__}:Exiting", "kwargs": {"where": where}} | environment
     return LeagueConfig.from_mapping({"league": "x", "environment": environment})
 
 
@@ -79,6 +83,14 @@ def test_an_examination_names_the_line(subtests: pytest.Subtests) -> None:
         with subtests.test(where=where):
             (fault,) = (finding for finding in examine(config(where)).findings if finding.severity == "fault")
             assert f"{problem}: ExitCalled: sys.exit(0) was called" in str(fault)
+
+
+def test_an_exit_in_close_is_a_note_beside_other_findings() -> None:
+    league = config("close", kwargs={"where": "close", "bad_reward": float("nan")})
+    reward, *_, close = examine(league).findings
+    assert "got a reward of nan" in str(reward)
+    assert close.severity == "note"
+    assert re.search(r"^`close` raised .*test_exits.py, line \d+\): ExitCalled: sys.exit\(0\) was called$", str(close))
 
 
 def test_what_exits_cannot_be_created_or_imported(tmp_path: Path) -> None:

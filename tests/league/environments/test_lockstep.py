@@ -20,16 +20,25 @@ from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build
 from league.environments.lockstep import Lockstep, stock_stepping
 from league.environments.stepping import BatchedEnvironment, Turn, each_agent_alone
-from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward, LeagueError
+from league.errors import ConfigError, EnvironmentMismatch, IllegalAction, InvalidReward, LeagueError
 from tests.conformance.stepping import (
     assert_same_episode,
     assert_stepping_conforms,
     lockstep,
     states_of,
 )
+from tests.support.environments import engines
 from tests.support.environments.cases import CASES, Case
 from tests.support.environments.episodes import episodes
 from tests.support.environments.simultaneous import RLlibSimultaneous, Simultaneous, meeting
+
+
+def test_environments_are_closed_if_a_further_one_cannot_be_created() -> None:
+    """With a fixed port, for example."""
+    environment = EnvironmentConfig(entry_point=f"{engines.__name__}:engine", kwargs={"most": 2})
+    with pytest.raises(ConfigError, match="OSError: Address already in use"):
+        stock_stepping(environment, 3)
+    assert engines.RUNNING == []
 
 
 def config(function: str = "meeting", **kwargs: Any) -> EnvironmentConfig:

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import yaml
 
+from league.environments.building import divide
 from league.environments.conformance.findings import Examination
 from league.environments.conformance.openings import OpeningMeasurement
 from league.environments.conformance.proposal import _header, _inline, _play, _policies, _training, propose
@@ -118,3 +119,16 @@ def test_policies_and_sides() -> None:
     assert document["policies"]["policy_0"] == [f"player_{number}" for number in range(9)], "a pattern fits others"
     assert document["sides"] is None
     assert parsed(_policies(many, is_team=True))["sides"] == {"team": ["*"]}
+
+
+def test_a_pattern_fits_agents_with_brackets() -> None:
+    names = {"few": ["gate"], "many": [f"unit[a]_{number}" for number in range(9)]}
+    policies = {agent: policy for policy, agents in names.items() for agent in agents}
+    described = Interface(
+        agents={agent: spaces() for agent in policies},
+        policies=policies,
+        sides={agent: (agent,) for agent in policies},
+    )
+    proposed = parsed(_policies(described, is_team=False))["policies"]
+    assert proposed == {"few": ["gate"], "many": ["unit[[]a]_*"]}
+    assert divide("policies", proposed, list(policies)) == policies

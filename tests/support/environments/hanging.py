@@ -7,6 +7,8 @@ from typing import Any
 
 from pettingzoo.classic import tictactoe_v3
 
+from evaluation.matches.watchdog import TICK
+
 
 class Hanging(tictactoe_v3.raw_env):
     def step(self, action: Any) -> None:
@@ -22,7 +24,7 @@ class BlockingSignals(tictactoe_v3.raw_env):
     """Ignores signals, like native code that does not return."""
 
     def step(self, action: Any) -> None:
-        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
+        signal.pthread_sigmask(signal.SIG_BLOCK, [TICK])
         Event().wait()
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from league.config.league import LeagueConfig
-from league.errors import ArtifactCorrupt, GameHung
+from league.errors import ArtifactCorrupt, GameHung, LeagueError
 from league.registry.registry import Registry
 from league.registry.storage.rows import StrengthRow, VersionRow
 from tests.support.leagues.registries import LEAGUE, publish
@@ -113,7 +113,7 @@ def published(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     def publish(checkpoint: Any, *, parent: int | None, **_: Any) -> Any:
         if checkpoint.steps == 666:
-            raise RuntimeError("no export")
+            raise RuntimeError("signal only works in main thread")
         versions.append(SimpleNamespace(number=len(versions) + 1, steps=checkpoint.steps, parent=parent))
         return versions[-1]
 
@@ -122,10 +122,10 @@ def published(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return versions
 
 
-def queue_of(parent: int | None = None) -> PublishQueue:
-    run: Any = SimpleNamespace(
-        id="run", record=SimpleNamespace(config=None, parent=parent, git_commit=None, exploits=None)
-    )
+def queue_of(path: Path, parent: int | None = None) -> PublishQueue:
+    config = SimpleNamespace(league="a")
+    record = SimpleNamespace(config=config, parent=parent, git_commit=None, exploits=None)
+    run: Any = SimpleNamespace(id="run", path=path, record=record)
     unused: Any = None
     return PublishQueue(run, unused, unused, announce=lambda row: None)
 
@@ -140,7 +140,7 @@ def checkpoints(directory: Path, *steps: int) -> list[Path]:
 
 
 def test_each_version_has_the_one_before_as_its_parent(published: list[Any], tmp_path: Path) -> None:
-    paths, queue = checkpoints(tmp_path, 512, 1024, 1536, 2048), queue_of(parent=7)
+    paths, queue = checkpoints(tmp_path, 512, 1024, 1536, 2048), queue_of(tmp_path, parent=7)
     for path in paths:
         queue.add(path)
     queue.join()
@@ -149,17 +149,20 @@ def test_each_version_has_the_one_before_as_its_parent(published: list[Any], tmp
 
 
 def test_nothing_is_published_after_a_failure(published: list[Any], tmp_path: Path) -> None:
-    paths, queue = checkpoints(tmp_path, 512, 666, 1024), queue_of()
+    """The environment plays before a version is published: its exception is one sentence, with its line."""
+    paths, queue = checkpoints(tmp_path, 512, 666, 1024), queue_of(tmp_path)
     for path in paths:
         queue.add(path)
-    with pytest.raises(RuntimeError, match="no export"):
+    message = rf"^league a: training failed with RuntimeError: signal only works in main thread at {__file__}:\d+; see"
+    with pytest.raises(LeagueError, match=message):
         queue.join()
+    assert "Traceback" in (tmp_path / "error.txt").read_text()
     assert [version.steps for version in published] == [512]
     assert [path.exists() for path in paths] == [False, True, True], "later checkpoints remain on disk"
 
 
 def test_a_damaged_checkpoint_is_not_published(published: list[Any], tmp_path: Path) -> None:
-    paths, queue = checkpoints(tmp_path, 512), queue_of()
+    paths, queue = checkpoints(tmp_path, 512), queue_of(tmp_path)
     (paths[0] / "state.pkl").write_bytes(b"weight5")
     queue.add(paths[0])
     with pytest.raises(ArtifactCorrupt, match=r"512/state\.pkl was changed"):

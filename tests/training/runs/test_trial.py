@@ -10,8 +10,10 @@ import torch
 
 from league.config.environment import EnvironmentConfig
 from league.environments.building import interface
+from league.errors import ConfigError
 from league.registry.registry import Registry
 from league.settings import Storage
+from tests.support.environments import engines
 from tests.support.leagues import registries
 from tests.support.leagues.training_leagues import tictactoe
 from tests.support.policies.graphs import masked_mlp
@@ -48,6 +50,16 @@ def trial(directory: Path, start: StartState = FROM_SCRATCH, environment: str = 
     plan = TrialPlan(start, directory / "checkpoints", directory / "end", Storage.at(directory))
     interface_ = interface(league)
     return Trial({"league": league.model_dump(by_alias=True), "interface": interface_.model_dump(), "plan": plan})
+
+
+@pytest.mark.usefixtures("ray_session")
+def test_an_exception_of_the_start_is_raised_by_the_first_step(tmp_path: Path) -> None:
+    """Of one that a constructor raises, Ray passes on the text only. What was started is stopped."""
+    failed = trial(tmp_path, environment=f"{engines.__name__}:only_engine")
+    with pytest.raises(ConfigError, match=r"cannot be created \(.*\): OSError: Address already in use$"):
+        failed.step()
+    failed.cleanup()
+    assert engines.RUNNING == []
 
 
 def run(trial: Trial) -> list[dict[str, Any]]:
