@@ -15,7 +15,7 @@ from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.registry.storage.manifest import Tensor
 from league.spaces import ACTION_MASK, Box, DictSpace, Discrete, Leaf, MultiDiscrete, inputs
 from league.spaces.arrays import bounds
-from training.importing.graph_mapping import GraphMapping, InputMapping, graph_inputs, tensors
+from training.importing.graph_mapping import GraphMapping, InputMapping, Shape, batch_axis, graph_inputs, tensors
 
 OPSET = 18
 BATCH = "batch"
@@ -52,8 +52,9 @@ def adapt(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface,
         dtype, shape = model_inputs[name]
         builder.feed(input_mapping, leaves[input_mapping.name], PREFIX + name, dtype, shape)
     for number, (name, after) in enumerate(mapping.state.items()):
-        builder.node("Identity", [f"{STATE_IN}{number}"], PREFIX + name)
-        builder.node("Identity", [PREFIX + after], f"{STATE_OUT}{number}")
+        _, shape = model_inputs[name]
+        builder.move_axis(f"{STATE_IN}{number}", PREFIX + name, len(shape), 0, batch_axis(shape))
+        builder.move_axis(PREFIX + after, f"{STATE_OUT}{number}", len(shape), batch_axis(shape), 0)
     masked = ACTION_MASK in leaves
     if isinstance(action, Box):
         builder.box(PREFIX + mapping.output, mapping, action)
@@ -78,8 +79,8 @@ def graph_tensors(
     )
     before, after = (
         tuple(
-            Tensor(name=f"{prefix}{number}", dtype=model_inputs[name][0], shape=(None, *model_inputs[name][1][1:]))
-            for number, name in enumerate(mapping.state)
+            Tensor(name=f"{prefix}{number}", dtype=dtype, shape=(None, *(size for size in shape if size is not None)))
+            for number, (dtype, shape) in enumerate(model_inputs[name] for name in mapping.state)
         )
         for prefix in (STATE_IN, STATE_OUT)
     )
@@ -100,10 +101,10 @@ def check(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface,
     if missing := sorted(model_inputs.keys() - mapping.inputs.keys() - mapping.state.keys()):
         refuse(f"input {missing[0]} of the graph is not in the mapping")
     for name, (_, shape) in model_inputs.items():
-        if shape[:1] not in ((), (None,)):
+        if name not in mapping.state and shape[:1] not in ((), (None,)):
             refuse(
                 f"input {name} has a fixed batch size of {shape[0]}: export it with a dynamic one, in PyTorch with"
-                f" dynamic_shapes={{'{name}': {{0: torch.export.Dim('batch')}}}}"
+                " torch.export.Dim('batch') as its axis 0 in dynamic_shapes, and example inputs of two or more rows"
             )
     for name, input_mapping in mapping.inputs.items():
         if name not in model_inputs:
@@ -114,14 +115,36 @@ def check(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface,
     for name in (mapping.output, *mapping.state.values()):
         if name not in results:
             refuse(f"output {name}: the graph has the outputs {', '.join(results)}")
-    for name in mapping.state:
-        if name not in model_inputs or None in model_inputs[name][1][1:]:
-            refuse(f"state.{name}: expected an input of the graph with known sizes")
+    for name, after in mapping.state.items():
+        if name not in model_inputs:
+            refuse(f"state.{name}: the graph has the inputs {', '.join(model_inputs)}")
+        _check_state(name, model_inputs[name][1], after, results[after][1], refuse)
     _check_output(results[mapping.output][1][1:], mapping, spaces, refuse)
 
 
+def _check_state(name: str, shape: Shape, after: str, shape_after: Shape, refuse: Callable[[str], None]) -> None:
+    free = [axis for axis, size in enumerate(shape) if size is None]
+    if not free:
+        refuse(
+            f"state {name} has the fixed shape {list(shape)}: export it with a dynamic batch, in PyTorch with"
+            " torch.export.Dim('batch') in dynamic_shapes, as axis 1 of (layers, batch, width), and example inputs of"
+            " two or more rows"
+        )
+    if len(free) > 1:
+        refuse(f"state {name} has the dynamic axes {free}: expected one, the batch, and fixed sizes of the others")
+    # Without a shape, or with one that the exporter has not inferred, the output is known only when it runs.
+    pairs = zip(shape, shape_after, strict=False)
+    is_other = len(shape_after) != len(shape) or any(None not in pair and pair[0] != pair[1] for pair in pairs)
+    if shape_after and (is_other or (None in shape_after and shape_after[free[0]] is not None)):
+        refuse(f"output {after} has shape {_sizes(shape_after)}, but its state {name} has {_sizes(shape)}")
+
+
+def _sizes(shape: Shape) -> str:
+    return f"[{', '.join('batch' if size is None else str(size) for size in shape)}]"
+
+
 def _check_shape(
-    sizes: tuple[int | None, ...],
+    sizes: Shape,
     name: str,
     own: InputMapping,
     shape: tuple[int, ...],
@@ -135,9 +158,7 @@ def _check_shape(
         refuse(f"input {name} has shape {list(sizes)}, but {own.name} has {list(ordered)}")
 
 
-def _check_output(
-    sizes: tuple[int | None, ...], mapping: GraphMapping, spaces: AgentInterface, refuse: Callable[[str], None]
-) -> None:
+def _check_output(sizes: Shape, mapping: GraphMapping, spaces: AgentInterface, refuse: Callable[[str], None]) -> None:
     if isinstance(spaces.action, DictSpace):
         refuse("dict actions are not supported")
     allowed = (
@@ -167,6 +188,12 @@ class _Builder:
         if shape[1:] != own.shape(leaf.shape) and None not in shape[1:]:
             value = self._reshaped(value, shape[1:])
         self.node("Identity", [value], name)
+
+    def move_axis(self, value: str, result: str, rank: int, first: int, last: int) -> None:
+        """As `np.moveaxis`."""
+        order = [axis for axis in range(rank) if axis != first]
+        order.insert(last, first)
+        self.node("Transpose", [value], result, perm=order)
 
     def logits(self, output: str, mapping: GraphMapping, action: Leaf, masked: bool) -> None:
         """Greedy action of masked logits, logarithms of probabilities, or action values."""

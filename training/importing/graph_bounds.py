@@ -118,18 +118,23 @@ def bounded(model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterfac
     for weight in (*flat.graph.initializer, *constants):
         if weight.data_location == TensorProto.EXTERNAL:
             raise InvalidInput(f"{source}: {weight.name} is in another file that could not be included")
-    leaves, shapes = inputs(spaces.observation), dict[str, Shape]()
-    for name, (_, (_, *sizes)) in graph_inputs(flat).items():
-        input_mapping = mapping.inputs.get(name)
-        observed = input_mapping.shape(leaves[input_mapping.name].shape) if input_mapping is not None else ()
-        fixed_sizes = tuple(size for size in sizes if size is not None)
-        shapes[name] = fixed_sizes if len(fixed_sizes) == len(sizes) else observed
-    graph, largest = _BoundedGraph(flat, shapes, source), largest_batch(spaces)
+    graph, largest = _BoundedGraph(flat, _input_shapes(flat, mapping, spaces), source), largest_batch(spaces)
     last, before, one = (graph.check(rows) for rows in (largest, max(1, largest - 1), 1))
     if not all(_increases(node, one, before, last) for node in flat.graph.node):
         for rows in range(2, largest - 1):
             graph.check(rows)
     return flat
+
+
+def _input_shapes(
+    model: onnx.ModelProto, mapping: GraphMapping, spaces: AgentInterface
+) -> dict[str, tuple[int | None, ...]]:
+    """Return input → shape, in which only the batch is None. What a graph leaves open of an observation is known."""
+    leaves, shapes = inputs(spaces.observation), {name: shape for name, (_, shape) in graph_inputs(model).items()}
+    for name, input_mapping in mapping.inputs.items():
+        if None in shapes[name][1:]:
+            shapes[name] = (None, *input_mapping.shape(leaves[input_mapping.name].shape))
+    return shapes
 
 
 class _CheckedBatch(NamedTuple):
@@ -141,9 +146,9 @@ class _CheckedBatch(NamedTuple):
 
 
 class _BoundedGraph:
-    """The nodes of a model, with what is known about them. shapes: input → shape without the batch."""
+    """The nodes of a model, with what is known about them. shapes: see `_input_shapes`."""
 
-    def __init__(self, model: onnx.ModelProto, shapes: Mapping[str, Shape], source: str) -> None:
+    def __init__(self, model: onnx.ModelProto, shapes: Mapping[str, tuple[int | None, ...]], source: str) -> None:
         self._nodes, self._source, self._ir_version = list(model.graph.node), source, model.ir_version
         self._opsets = list(model.opset_import)
         self._version = next((opset.version for opset in self._opsets if opset.domain in ("", "ai.onnx")), 1)
@@ -167,7 +172,7 @@ class _BoundedGraph:
         """Check a batch of this size. Raises InvalidInput."""
         types, values = dict(self._types), dict(self._values)
         for name, (kind, shape) in self._given.items():
-            types[name] = helper.make_tensor_type_proto(kind, [rows, *shape])
+            types[name] = helper.make_tensor_type_proto(kind, [rows if size is None else size for size in shape])
         living = {name: _bytes(types[name]) for name in self._given}
         for position, node in enumerate(self._nodes):
             types |= self._infer(node, types, values)

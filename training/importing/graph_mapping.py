@@ -126,6 +126,15 @@ def inferred(model: onnx.ModelProto, spaces: AgentInterface, source: str) -> Gra
     )
 
 
+def batch_axis(shape: Shape) -> int:
+    """Return the axis of a recurrent state that is the batch: the only one without a fixed size.
+
+    It is the second one in PyTorch's and ONNX's own order, (layers, batch, width). shape: `adapted_graph.check` accepts
+    it.
+    """
+    return shape.index(None)
+
+
 def graph_inputs(model: onnx.ModelProto) -> dict[str, tuple[str, Shape]]:
     """Return name → dtype and shape of the inputs that are not weights."""
     weights = {weight.name for weight in model.graph.initializer}

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from league.errors import ConfigError, InvalidInput, LeagueError, one_line
 from league.interface import AgentInterface, Interface
+from training.importing.git_lfs import require_content
 from training.importing.source import Source, onnx_source
 
 SourceKind = Literal["rllib", "sb3"]
@@ -47,7 +48,7 @@ def open_sources(
         Policy id → model, and a digest of the source's content.
 
     Raises:
-        ConfigError: A file is missing, or its format is unknown.
+        ConfigError: A file is missing, its format is unknown, or it is a pointer of Git LFS.
         EnvironmentMismatch: A model does not fit the league.
         InvalidInput: A format that can run code is not trusted. Nothing of it was read.
     """
@@ -118,13 +119,16 @@ def _read(
 
 def _file(path: Path, policy: str, suffixes: Sequence[str]) -> Path:
     """Return the file of a policy: `path`, or the one named after the policy in the directory `path`."""
-    if not suffixes or not path.is_dir():
-        return path
-    candidates = [path / f"{policy}{suffix}" for suffix in suffixes]
-    for file in candidates:
-        if file.exists():
-            return file
-    raise ConfigError(f"{path}: no file {' or '.join(file.name for file in candidates)}")
+    file = path
+    if suffixes and path.is_dir():
+        candidates = [path / f"{policy}{suffix}" for suffix in suffixes]
+        existing = [candidate for candidate in candidates if candidate.exists()]
+        if not existing:
+            raise ConfigError(f"{path}: no file {' or '.join(candidate.name for candidate in candidates)}")
+        file = existing[0]
+    for part in file.rglob("*") if file.is_dir() else [file]:
+        require_content(part)
+    return file
 
 
 def _digest(path: Path, others: Sequence[Path | None], modules: Mapping[str, str] | None) -> str:

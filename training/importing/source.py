@@ -9,18 +9,19 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from league.errors import ConfigError, GraphTimeout, InvalidInput, one_line
+from league.errors import ConfigError, GraphTimeout, InvalidInput, LeagueError, one_line
 from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
 from league.policies.graph_runs import open_session, run_graph
 from league.policies.onnx import RUN_TIMEOUT
 from league.spaces import ACTION_MASK, DictSpace
 from training.importing.adapted_graph import check, decoded
+from training.importing.git_lfs import require_content
 from training.importing.graph_bounds import bounded
-from training.importing.graph_mapping import GraphMapping, graph_inputs, inferred
+from training.importing.graph_mapping import GraphMapping, batch_axis, graph_inputs, inferred
 
 State = dict[str, NDArray]
-"""Recurrent input of the source's graph → (k, …)"""
+"""Recurrent input of the source's graph → (k, …), with the batch as first axis whatever its order in the graph"""
 
 
 class Original(Protocol):
@@ -62,14 +63,16 @@ class OnnxOriginal:
 
     def initial_state(self, rows: int) -> State:
         """Return zeros."""
+        tensors = {name: self._given[name] for name in self._mapping.state}
         return {
-            name: np.zeros((rows, *(size or 1 for size in self._given[name][1][1:])), self._given[name][0])
-            for name in self._mapping.state
+            name: np.zeros((rows, *(size for size in shape if size is not None)), dtype)
+            for name, (dtype, shape) in tensors.items()
         }
 
     def act(self, observations: Mapping[str, NDArray], state: State) -> tuple[NDArray, NDArray | None, State]:
         """Run the graph. Raises InvalidInput if it fails."""
-        feed = dict(state)
+        axes = {name: batch_axis(self._given[name][1]) for name in self._mapping.state}
+        feed = {name: np.ascontiguousarray(np.moveaxis(value, 0, axes[name])) for name, value in state.items()}
         for name, input_mapping in self._mapping.inputs.items():
             dtype, shape = self._given[name]
             value = observations[input_mapping.name].astype(dtype)
@@ -84,7 +87,8 @@ class OnnxOriginal:
         except Exception as error:
             raise InvalidInput(f"{self._source}: the graph fails on observations: {one_line(error)}") from error
         actions, logits = decoded(value, observations.get(ACTION_MASK), self._mapping, self._action)
-        return actions, logits, dict(zip(self._mapping.state, after, strict=True))
+        states = zip(axes.items(), after, strict=True)
+        return actions, logits, {name: np.moveaxis(value, axis, 0) for (name, axis), value in states}
 
 
 def onnx_source(path: Path, mapping: Path | None, spaces: AgentInterface, origin: dict[str, Any]) -> Source:
@@ -101,8 +105,14 @@ def onnx_source(path: Path, mapping: Path | None, spaces: AgentInterface, origin
         EnvironmentMismatch: The graph does not fit the spaces.
     """
     try:
-        model = onnx.load(str(path))
+        model = onnx.load(str(path), load_external_data=False)
+        entries = [entry for weight in model.graph.initializer for entry in weight.external_data]
+        for file in {entry.value for entry in entries if entry.key == "location"}:
+            require_content(path.parent / file)
+        onnx.load_external_data_for_model(model, str(path.parent))
         onnx.checker.check_model(model)
+    except LeagueError:
+        raise
     except Exception as error:
         raise ConfigError(f"{path}: not an ONNX model: {one_line(error)}") from error
     beside = path.with_suffix(".yaml")

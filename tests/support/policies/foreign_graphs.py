@@ -78,6 +78,51 @@ def remembering(size: int, outputs: int) -> bytes:
     return _model(nodes, value_infos, results, weights, 18)
 
 
+def recurrent(size: int, outputs: int, *, operator: str = "GRU", layers: int = 1, directions: int = 1) -> bytes:
+    """A recurrent graph whose states have the order of ONNX's operators, and PyTorch's: (layers, batch, width).
+
+    operator: GRU with `h_in`, or LSTM, which also has `c_in`. Each of the `layers` has as many states as `directions`.
+    """
+    rng, width = np.random.default_rng(0), 4
+    gates, letters = (3, "h") if operator == "GRU" else (4, "hc")
+    direction = "bidirectional" if directions == 2 else "forward"
+    weights = {
+        "first": np.array([0], np.int64),
+        "joined": np.array([1, -1, directions * width], np.int64),
+        "w": rng.normal(size=(directions * width, outputs)).astype(np.float32),
+    }
+    nodes = [helper.make_node("Unsqueeze", ["planes", "first"], ["below_0"])]
+    for letter in letters:
+        parts = [f"{letter}_in_{layer}" for layer in range(layers)]
+        nodes.append(helper.make_node("Split", [f"{letter}_in"], parts, axis=0, num_outputs=layers))
+    for layer in range(layers):
+        features = directions * width if layer else size
+        for name, columns in (("input", features), ("state", width)):
+            weights[f"{name}_{layer}"] = rng.normal(size=(directions, gates * width, columns)).astype(np.float32)
+        before = [f"{letter}_in_{layer}" for letter in letters]
+        after = [f"{letter}_out_{layer}" for letter in letters]
+        arguments = [f"below_{layer}", f"input_{layer}", f"state_{layer}", "", "", *before]
+        nodes += [
+            helper.make_node(operator, arguments, [f"y_{layer}", *after], hidden_size=width, direction=direction),
+            helper.make_node("Transpose", [f"y_{layer}"], [f"turned_{layer}"], perm=[0, 2, 1, 3]),
+            helper.make_node("Reshape", [f"turned_{layer}", "joined"], [f"below_{layer + 1}"]),
+        ]
+    for letter in letters:
+        parts = [f"{letter}_out_{layer}" for layer in range(layers)]
+        nodes.append(helper.make_node("Concat", parts, [f"{letter}_out"], axis=0))
+    nodes += [
+        helper.make_node("Squeeze", [f"below_{layers}", "first"], ["features"]),
+        helper.make_node("MatMul", ["features", "w"], ["policy_head"]),
+    ]
+    order = [layers * directions, "N", width]
+    infos = {"planes": ["N", size], "policy_head": ["N", outputs]}
+    infos |= {f"{letter}_{way}": order for letter in letters for way in ("in", "out")}
+    described = {name: helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in infos.items()}
+    arguments = ["planes", *(f"{letter}_in" for letter in letters)]
+    results = ["policy_head", *(f"{letter}_out" for letter in letters)]
+    return _model(nodes, [described[name] for name in arguments], [described[name] for name in results], weights, 18)
+
+
 def _model(
     nodes: list[NodeProto], value_infos: list, results: list, weights: dict[str, np.ndarray], opset: int
 ) -> bytes:

@@ -16,7 +16,7 @@ from league.policies import load
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
 from tests.support.leagues import tictactoe
-from tests.support.policies.foreign_graphs import foreign, influenced
+from tests.support.policies.foreign_graphs import foreign, influenced, recurrent
 from training.importing import checks
 from training.importing.open_source import open_sources
 from training.importing.publish import publish
@@ -141,6 +141,29 @@ def test_a_graph_acts_on_each_observation_by_itself(
         with subtests.test(kind), pytest.raises(ParityError, match=f"policy shared:? {problem}"):
             imported(registry, path)
     assert registry.versions.all(tictactoe.LEAGUE) == []
+
+
+def test_a_graph_with_the_layers_of_its_state_first_acts_on_each_observation_by_itself(
+    registry: Registry, tmp_path: Path, mapping: Path
+) -> None:
+    path = tmp_path / "foreign.onnx"
+    mapping.write_text(
+        "{inputs: {planes: observation}, output: policy_head, kind: logits, state: {h_in: h_out, c_in: c_out}}"
+    )
+    path.write_bytes(recurrent(18, 9, operator="LSTM", layers=2))
+    policy = load(imported(registry, path, mapping).ref, registry=registry)
+    observation = {"observation": np.ones((3, 3, 3, 2), np.int8), "action_mask": np.ones((3, 9), np.int8)}
+    state = policy.act(observation).state
+    assert state is not None
+    assert {name: array.shape for name, array in state.items()} == {"state_in_0": (3, 2, 4), "state_in_1": (3, 2, 4)}
+    mixing = onnx.load_from_string(path.read_bytes())
+    (after,) = [node for node in mixing.graph.node if "c_out" in node.output]
+    after.output[:] = ["apart"]
+    mixing.graph.initializer.append(onnx.numpy_helper.from_array(np.int64(1), "batch_axis"))
+    mixing.graph.node.append(onnx.helper.make_node("CumSum", ["apart", "batch_axis"], ["c_out"]))
+    path.write_bytes(mixing.SerializeToString())
+    with pytest.raises(ParityError, match=OTHER_ROWS):
+        imported(registry, path, mapping)
 
 
 def test_files_that_cannot_be_read_are_named(
