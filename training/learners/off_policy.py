@@ -18,7 +18,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from league.config.league import LeagueConfig
 from league.config.off_policy import OffPolicyConfig
 from league.interface import Interface
-from training.learners.optimizer import ClippedAdam, warn_of_dropped_gradients
+from training.learners.optimizer import ClippedAdam, check_gradients
 from training.learners.processor import keep_memory
 from training.modules.policy_module import MASKED_LOGIT
 from training.replay_buffer import Sample
@@ -242,7 +242,7 @@ class OffPolicyLearner(FixedPoliciesLearner):
                 self.metrics.log_dict(means, key=key, window=1)
                 learned.append(key)
             sums.zero_()
-        warn_of_dropped_gradients(self._optimizers)
+        check_gradients(self._optimizers)
         metrics = self.metrics.reduce()
         return {key: metrics[key] for key in learned}
 

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from league.errors import InvalidInput
 from training.rllib_compat import fused_adam
 
 logger = logging.getLogger(__name__)
@@ -102,6 +103,11 @@ class ClippedAdam(torch.optim.Adam):
             for part, parameter in zip(parts, self._parameters, strict=True)
         ]
 
+    @property
+    def has_stepped(self) -> bool:
+        """Whether a gradient has ever been finite."""
+        return bool(self._count)
+
     def take_dropped(self) -> int:
         """Return the number of gradients that were not finite since the last call."""
         dropped = int(self._dropped)
@@ -109,8 +115,17 @@ class ClippedAdam(torch.optim.Adam):
         return dropped
 
 
-def warn_of_dropped_gradients(optimizers: Mapping[str, ClippedAdam]) -> None:
-    """Log the names of optimisers whose gradients were not finite since the last call."""
+def check_gradients(optimizers: Mapping[str, ClippedAdam]) -> None:
+    """Log the names of optimisers whose gradients were not finite since the last call.
+
+    Raises InvalidInput for one that has had no other: its network learns nothing, although a run would go on.
+    """
     for name, optimizer in optimizers.items():
         if dropped := optimizer.take_dropped():
+            if not optimizer.has_stepped:
+                raise InvalidInput(
+                    f"training: all {dropped} gradients of {name} are not finite: observations, rewards or outputs of"
+                    " its network are too large; `league check-env` names such observations: scale them, or set"
+                    " training.normalize_observations"
+                )
             logger.warning("Dropped a non-finite gradient of %s: %d in this update.", name, dropped)

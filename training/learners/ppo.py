@@ -19,7 +19,7 @@ from league.config.schedules import Scheduled, ScheduleProgress, scheduled_value
 from league.errors import ConfigError
 from league.interface import Interface
 from training.learners.magnet import Magnet, Previous, magnet, states
-from training.learners.optimizer import ClippedAdam, warn_of_dropped_gradients
+from training.learners.optimizer import ClippedAdam, check_gradients
 from training.learners.processor import fast_products, keep_memory
 from training.learners.ranks import ALONE, Rank
 from training.learners.train_batch import (
@@ -296,7 +296,7 @@ class PPOLearner(FixedPoliciesLearner):
                 size = minibatch_size or max(len(batch) for batch in batches.values())
                 drawn = minibatches(batches, size=size, epochs=num_epochs, rank=self.rank)
                 self._log(batches, self._gradient_steps(drawn))
-                warn_of_dropped_gradients(self._optimizers)
+                check_gradients(self._optimizers)
         metrics = self.metrics.reduce()
         # RLlib reports NaN for policies that were logged earlier but not in this update.
         return {policy: metrics[policy] for policy in batches}

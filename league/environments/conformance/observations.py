@@ -56,9 +56,9 @@ class ObservationCheck:
         for name, leaf in self._raw.items() if not misshapen else ():
             largest = np.abs(arrays[name].astype(np.float64)).max()
             if LARGEST < largest < np.inf:
-                text = f"observes {largest:.3g} in {name}: training needs values of at most {LARGEST:g}: scale them"
-                is_float = np.dtype(leaf.dtype).kind == "f"
-                self._found.add("fault", text + (", or set training.normalize_observations" * is_float), self._agent)
+                text = f"observes too large values in {name}: training needs at most {LARGEST:g}: scale them"
+                remedy = ", or set training.normalize_observations" * (np.dtype(leaf.dtype).kind == "f")
+                self._found.add("fault", text + remedy, self._agent, example=f"{largest:.3g}")
         if not misshapen and not self._gymnasium.contains(value):
             self._found.add(
                 "note",

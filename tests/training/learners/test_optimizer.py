@@ -7,7 +7,8 @@ import pytest
 import torch
 from torch import nn
 
-from training.learners.optimizer import ClippedAdam, warn_of_dropped_gradients
+from league.errors import InvalidInput
+from training.learners.optimizer import ClippedAdam, check_gradients
 from training.learners.processor import fast_products, keep_memory
 from training.modules.encoder import Encoder, has_bfloat16
 
@@ -102,15 +103,30 @@ def test_a_gradient_that_is_not_finite_changes_nothing(value: float, caplog: pyt
     loss(module, 1.0).backward()
     optimizer.clip_and_step()
     before, state = weights(module), copy.deepcopy(optimizer.state_dict())
-    warn_of_dropped_gradients({"a": optimizer})
+    check_gradients({"a": optimizer})
     assert not caplog.text
     loss(module, value).backward()
     assert not optimizer.clip_and_step().isfinite()
     assert torch.equal(weights(module), before)
     torch.testing.assert_close(optimizer.state_dict()["state"], state["state"])
-    warn_of_dropped_gradients({"a": optimizer})
+    check_gradients({"a": optimizer})
     assert "Dropped a non-finite gradient of a: 1 in this update." in caplog.text
     assert optimizer.take_dropped() == 0
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_network_that_learns_nothing_is_an_error(value: float) -> None:
+    """Observations of 1e18 give such gradients from the first one on, and training would report progress to its end."""
+    module = network()
+    optimizer = ClippedAdam(module.parameters(), lr=LR, max_norm=MAX_NORM)
+    check_gradients({"a": optimizer})
+    for _ in range(2):
+        loss(module, value).backward()
+        optimizer.clip_and_step()
+    with pytest.raises(
+        InvalidInput, match=r"^training: all 2 gradients of a are not finite: .*normalize_observations$"
+    ):
+        check_gradients({"a": optimizer})
 
 
 def test_products_are_close_and_the_setting_is_restored() -> None:

@@ -154,6 +154,7 @@ def test_a_shared_encoder_has_one_optimizer_for_the_losses_of_all_policies(two: 
 
 def test_a_gradient_that_is_not_finite_is_dropped(two: tuple, caplog: pytest.LogCaptureFixture) -> None:
     learner = learner_of(two[0])
+    update(learner, two[1])
     with torch.no_grad():
         learner.module["a"].value_head.bias.fill_(1e30)
     before = weights(learner)
