@@ -43,7 +43,7 @@ FROM runtime AS server
 COPY --from=server-packages /opt/league /opt/league
 EXPOSE 8000 8001
 HEALTHCHECK --interval=10s --timeout=5s --start-period=120s --retries=3 \
-    CMD ["python", "-c", "import httpx; httpx.get('http://127.0.0.1:8000/v1/health/ready').raise_for_status()"]
+    CMD ["python", "-c", "import httpx; httpx.get('http://127.0.0.1:8000/v1/health/ready', trust_env=False).raise_for_status()"]
 CMD ["league", "serve", "--host", "0.0.0.0"]
 
 # box2d and rlcard are compiled or packed from their sources.

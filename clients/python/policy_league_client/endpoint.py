@@ -8,8 +8,10 @@ import httpx
 
 from policy_league_client.calls import ApiCall
 from policy_league_client.errors import InvalidInput, RemoteError, one_line
+from policy_league_client.proxies import is_loopback, through_proxy, usable_proxies
 from policy_league_client.retries import Outcome, parse_error, parse_object
 
+C = TypeVar("C", httpx.Client, httpx.AsyncClient)
 T = TypeVar("T")
 
 DEFAULT_URL = "http://127.0.0.1:8000"
@@ -51,9 +53,16 @@ class Endpoint:
         # httpx would compute these for every request, which takes half of the client's time for it.
         self._headers = httpx.Headers({"host": host, "accept-encoding": "gzip", **self.headers})
         self._post_headers = httpx.Headers({**self._headers, "content-type": "application/json"})
-        self.is_encrypted = base.scheme == "https"
-        """Whether certificates are verified; loading them takes time."""
+        self.is_loopback = is_loopback(base.host)
+        """Whether the server is on this machine, which no proxy reaches."""
         self._extensions = {"timeout": httpx.Timeout(timeout).as_dict()}
+
+    def http_client(self, client: type[C]) -> C:
+        """Create the HTTP client, `httpx.Client` or `httpx.AsyncClient`. Raises InvalidInput for an unusable proxy."""
+        # Loading certificates takes time.
+        verify = httpx.create_ssl_context() if self.url.startswith("https") else False
+        with usable_proxies():
+            return client(limits=LIMITS, verify=verify, trust_env=not self.is_loopback)
 
     @property
     def websocket_url(self) -> str:
@@ -73,7 +82,7 @@ class Endpoint:
         """Return the result of a call. Raises the LeagueError that corresponds to a failure."""
         url = self.url + call.path
         if not isinstance(outcome, httpx.Response):
-            raise RemoteError(f"{url} cannot be reached: {one_line(outcome)}") from outcome
+            raise RemoteError(f"{url} cannot be reached{through_proxy(url)}: {one_line(outcome)}") from outcome
         body = parse_object(outcome)
         if outcome.status_code in (200, 202) and body is not None:
             return call.parse(body, outcome.headers.get("x-league-replica", ""))

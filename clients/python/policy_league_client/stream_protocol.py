@@ -13,6 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 
 from policy_league_client.endpoint import Endpoint
 from policy_league_client.errors import BodyTooLarge, LeagueError, RemoteError, Unauthenticated, one_line
+from policy_league_client.proxies import through_proxy
 from policy_league_client.refs import CHAMPION
 from policy_league_client.requests import ActionRequest, BatchActionRequest, to_json
 from policy_league_client.responses import (
@@ -125,7 +126,7 @@ class StreamProtocol:
         if isinstance(error, ConnectionClosed) and error.rcvd is not None and error.rcvd.code in PERMANENT_CLOSE_CODES:
             kind = PERMANENT_CLOSE_CODES[error.rcvd.code]
             raise kind(f"{self.url} was closed: {error.rcvd.reason or error}") from error
-        return httpx.ReadError(f"the connection was lost: {one_line(error)}")
+        return httpx.ReadError(f"the connection{through_proxy(self._endpoint.url)} was lost: {one_line(error)}")
 
     def next_delay(self, retries: Retries, outcome: Outcome) -> float | None:
         """Return the seconds until the message is sent again, None after a response.

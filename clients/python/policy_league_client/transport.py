@@ -4,11 +4,15 @@ import asyncio
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection as _AsyncConnection
 from websockets.asyncio.client import connect as _async_connect
 from websockets.sync.client import ClientConnection as _Connection
 from websockets.sync.client import connect as _connect
+
+from policy_league_client.proxies import is_loopback, usable_proxies
 
 CLOSE_TIMEOUT = 1.0
 """Seconds that a server has to confirm the end of a WebSocket connection."""
@@ -33,26 +37,25 @@ def time_limit(_: float) -> AbstractContextManager[None]:
 
 async def async_connect(url: str, headers: Mapping[str, str], timeout: float) -> AsyncConnection:
     """Open a WebSocket connection."""
-    return await _async_connect(
-        url,
-        additional_headers=headers,
-        compression=None,
-        open_timeout=timeout,
-        close_timeout=CLOSE_TIMEOUT,
-        max_size=None,
-    )
+    with usable_proxies():
+        return await _async_connect(url, **_options(url, headers, timeout))
 
 
 def connect(url: str, headers: Mapping[str, str], timeout: float) -> Connection:
     """Open a WebSocket connection."""
-    return _connect(
-        url,
-        additional_headers=headers,
-        compression=None,
-        open_timeout=timeout,
-        close_timeout=CLOSE_TIMEOUT,
-        max_size=None,
-    )
+    with usable_proxies():
+        return _connect(url, **_options(url, headers, timeout))
+
+
+def _options(url: str, headers: Mapping[str, str], timeout: float) -> dict[str, Any]:
+    return {
+        "additional_headers": headers,
+        "compression": None,
+        "open_timeout": timeout,
+        "close_timeout": CLOSE_TIMEOUT,
+        "max_size": None,
+        "proxy": None if is_loopback(urlsplit(url).hostname or "") else True,
+    }
 
 
 async def async_receive(connection: AsyncConnection, _: float) -> str | bytes:

@@ -10,7 +10,7 @@ from policy_league_client import calls
 from policy_league_client._async.episode import AsyncEpisode
 from policy_league_client._async.stream import AsyncStream
 from policy_league_client.calls import ANY, ApiCall, Promotion
-from policy_league_client.endpoint import DEFAULT_URL, LIMITS, Endpoint
+from policy_league_client.endpoint import DEFAULT_URL, Endpoint
 from policy_league_client.errors import LeagueError, NotReady
 from policy_league_client.refs import CHAMPION
 from policy_league_client.requests import ActionRequest, BatchActionRequest, Encoding, JsonObject
@@ -40,7 +40,8 @@ class AsyncClient:
         encoding: Encoding of arrays in requests; see `policy_league_client.requests.Encoding`.
 
     Raises:
-        InvalidInput: The URL, the key, the caller or the timeout is invalid.
+        InvalidInput: The URL, the key, the caller or the timeout is invalid, or a proxy that an environment variable
+            names.
 
     Every method that sends a request raises the `LeagueError` that corresponds to the server's error code,
     `InvalidInput` or `InvalidReference` for arguments that cannot be sent, and `RemoteError` if the server is
@@ -60,7 +61,7 @@ class AsyncClient:
         self.endpoint = Endpoint(url, key, caller, timeout)
         self.retry_deadline = retry_deadline
         self.encoding: Encoding = encoding
-        self._http = httpx.AsyncClient(limits=LIMITS, verify=self.endpoint.is_encrypted)
+        self._http = self.endpoint.http_client(httpx.AsyncClient)
 
     async def act(
         self,
