@@ -94,12 +94,12 @@ class AnchorTest(Criterion):
             return paired_result(
                 self, contest, matches, ref=ref, opponent=ref, margin=margin, setting=setting, report=report
             )
-        decision = decide_matches(self.sequential(contest), matches)
+        decision, least = decide_matches(self.sequential(contest), matches), None
         if gate.model == "returns":
             bar, unit = f"its returns may be at most about {margin / 2:g} below those of {ref}", "in returns"
         else:
-            score = score_at(-margin / 2, decision.counts, gate.model)
-            bar, unit = f"it must score more than about {percent(score)} against {ref}", "Elo"
+            least = score_at(-margin / 2, decision.counts, gate.model)
+            bar, unit = f"it must score more than about {percent(least, decision.score)} against {ref}", "Elo"
         is_version = isinstance(parse_ref(ref), CheckpointRef)
         hint = "" if is_version else " With mode: no_worse, it need only do as well as the champion there."
         outcome, finding = worded(decision, "not inferior", "inferior", f"to {ref} by {margin:g} {unit}", ref)
@@ -117,13 +117,16 @@ class AnchorTest(Criterion):
             ),
             passed=f"is at most {margin:g} weaker than {ref}",
             failed=f"is weaker than {ref}",
-            scores=self._scores(contest, decision),
+            scores=self._scores(contest, decision, least),
             requirement=f"To pass, {bar} ({setting}: {margin:g}).{hint}",
             wider=f"a larger {setting}: {margin:g}",
         )
 
-    def _scores(self, contest: Contest, decision: Decision) -> str | None:
-        """The score of the candidate, and that of the champion in all games under the verdict's conditions."""
+    def _scores(self, contest: Contest, decision: Decision, least: float | None) -> str | None:
+        """The score of the candidate, and that of the champion in all games under the verdict's conditions.
+
+        least: what the candidate must score.
+        """
         if decision.score is None:
             return None
         champion, league, conditions = contest.champion, contest.verdict.league, contest.schedule.conditions
@@ -133,7 +136,8 @@ class AnchorTest(Criterion):
         for pair, of_pair in sums.items():
             score = of_pair.whole.points[pair.index(champion)] / of_pair.whole.played
             comparison = f"{champion} {percent(score)} in other games"
-        return f"Against {self.ref} it scored {percent(decision.score)} in {decision.games} games; {comparison}."
+        scored = percent(decision.score, least)
+        return f"Against {self.ref} it scored {scored} in {decision.games} games; {comparison}."
 
 
 def resolve_anchors(registry: Registry, league: LeagueRow, candidate: str, champion: str) -> list[AnchorConfig]:

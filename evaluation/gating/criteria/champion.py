@@ -38,19 +38,20 @@ class ChampionTest(Criterion):
     def result(self, contest: Contest, matches: Sequence[Match]) -> CriterionResult:
         gate, champion, title = contest.gate, contest.champion, contest.title
         decision = decide_matches(self.sequential(contest), matches)
+        score, least = decision.score, None
         if gate.model == "returns":
             hypotheses, bar = "gate.return0 and gate.return1", (gate.return0 + gate.return1) / 2
             requirement = f"To pass, its returns must exceed those of {champion} by more than about {bar:g} on average."
         else:
             hypotheses = "gate.elo0 and gate.elo1"
-            bar = score_at((gate.elo0 + gate.elo1) / 2, decision.counts, gate.model)
+            least = score_at((gate.elo0 + gate.elo1) / 2, decision.counts, gate.model)
             requirement = (
-                f"To pass, it must score more than about {percent(bar)} against {champion}"
+                f"To pass, it must score more than about {percent(least, score)} against {champion}"
                 f" (gate.elo0: {gate.elo0:g}, gate.elo1: {gate.elo1:g})."
             )
         scores = None
-        if (score := decision.score) is not None:
-            scores = f"It scored {percent(score)} against {champion}, which scored {percent(1 - score)}."
+        if score is not None:
+            scores = f"It scored {percent(score, least)} against {champion}, which scored {percent(1 - score, score)}."
         passed, failed = f"is not inferior to {title}", f"is inferior to {title}"
         if gate.requires_gain:
             passed, failed = f"beat {title}", f"is not stronger than {title}"

@@ -152,9 +152,10 @@ def paired_result(
     if decision.blocks and decision.observations:
         score, champion_score = decision.observations.means
         difference = student_interval(decision.observations.gaps)
-        scores = f"Against {ref} it scored {percent(score)}, and {champion} {percent(champion_score)}."
+        least = max(champion_score - margin / 2, 0)
+        scores = f"Against {ref} it scored {percent(score, least)}, and {champion} {percent(champion_score, least)}."
         if gate.model != "returns":
-            bar = f"it must score more than about {percent(max(champion_score - margin / 2, 0))} against {ref}"
+            bar = f"it must score more than about {percent(least, score, champion_score)} against {ref}"
     outcome, finding = worded(decision, "not worse", "worse", f"than {champion} by {margin:g} {unit}", champion)
     return CriterionResult(
         decision=decision,
@@ -199,9 +200,11 @@ def elo_statistics(decision: Decision) -> dict[str, Any]:
     }
 
 
-def percent(share: float) -> str:
-    """`75.9 %`"""
-    return f"{100 * share:.1f} %"
+def percent(share: float, *beside: float | None) -> str:
+    """`75.9 %`, with as many decimals, up to four, as tell it from the shares that it is compared with."""
+    shares = {value for value in (share, *beside) if value is not None}
+    distinct = (n for n in range(1, 4) if len({f"{100 * value:.{n}f}" for value in shares}) == len(shares))
+    return f"{100 * share:.{next(distinct, 4)}f} %"
 
 
 def margin_unit(model: str) -> str:

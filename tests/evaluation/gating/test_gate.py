@@ -17,7 +17,7 @@ from scipy.stats import binomtest
 from benchmarks.simulations.exploiter_gates import against_anchor
 from evaluation.gating.criteria.anchor import AnchorTest
 from evaluation.gating.criteria.champion import ChampionTest
-from evaluation.gating.criteria.criterion import Contest, Criterion
+from evaluation.gating.criteria.criterion import Contest, Criterion, percent
 from evaluation.gating.criteria.exploitability import ExploitabilityTest
 from evaluation.gating.criteria.exploiter import ExploiterTest
 from evaluation.gating.gate import (
@@ -400,6 +400,12 @@ def test_a_test_that_is_not_passed_is_named() -> None:
     note = "it beat the champion, but 200 games do not show that it is at most 50 weaker than l@1"
     assert (result.outcome, result.note) == ("inconclusive", note)
     assert gate_result("promote", "promote", planned=2).outcome is None, "one was not started"
+
+
+def test_shares_that_are_compared_have_the_decimals_that_tell_them_apart() -> None:
+    assert (percent(0.5), percent(0.5, 0.5), percent(0.5, None, 0.51)) == ("50.0 %",) * 3
+    assert (percent(0.5, 0.50004), percent(0.50004, 0.5)) == ("50.000 %", "50.004 %")
+    assert percent(0.5, 0.5 + 1e-9) == "50.0000 %"
 
 
 def test_each_outcome_has_its_reason_and_remedy() -> None:
