@@ -26,7 +26,10 @@ def disk_errors(path: Path, only: tuple[int, ...] | None = None, action: str = "
     except OSError as error:
         if only is not None and error.errno not in only:
             raise
-        raise StorageError(f"{error.filename or path} cannot be {action}: {error.strerror or error}") from error
+        name, reason = Path(error.filename or path), error.strerror or str(error)
+        if isinstance(error, FileExistsError) and name.is_symlink() and not name.exists():
+            reason = f"it is a link to {name.readlink()}, which does not exist"
+        raise StorageError(f"{name} cannot be {action}: {reason}") from error
 
 
 def full_disk(path: Path) -> str | None:

@@ -26,6 +26,18 @@ def small_disk(directory: Path, megabytes: int = 1) -> Iterator[Path]:
         subprocess.run(["umount", "--lazy", str(directory)], check=True)
 
 
+@contextmanager
+def read_only(directory: Path) -> Iterator[None]:
+    """Mount a directory over itself so that it can only be read, or skip the test."""
+    commands = [["mount", "--bind", directory, directory], ["mount", "-o", "remount,bind,ro", directory]]
+    if any(subprocess.run(command, capture_output=True).returncode for command in commands):
+        pytest.skip("a file system cannot be mounted here")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", "--lazy", directory], check=True)
+
+
 def fill(directory: Path) -> None:
     """Write until nothing more fits."""
     descriptor = os.open(directory / "ballast", os.O_CREAT | os.O_WRONLY | os.O_APPEND)

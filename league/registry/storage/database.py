@@ -373,7 +373,7 @@ def _engine(url: str, create: bool, listens: bool) -> Engine:
 
 
 def _sqlite(url: str, path: Path, create: bool) -> Engine:
-    if create:
+    if create and not path.exists():
         with disk_errors(path):
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             path.touch(mode=0o600)  # it contains digests of API keys; SQLite gives its other files the same mode
@@ -387,7 +387,7 @@ def _sqlite(url: str, path: Path, create: bool) -> Engine:
         record.info[FILE] = path, _identity(path)
         if record.info[FILE][1] is None:
             raise StorageError(f"the database {path} does not exist")
-        arguments[0] = f"file:{quote(path)}?mode=rw"
+        arguments[0] = f"file:{quote(path)}?{_access(path)}"
         options["uri"] = True
 
     @event.listens_for(engine, "checkout")
@@ -408,6 +408,14 @@ def _sqlite(url: str, path: Path, create: bool) -> Engine:
         connection.exec_driver_sql("BEGIN IMMEDIATE")
 
     return engine
+
+
+def _access(path: str) -> str:
+    """The parameters of SQLite's URI. A file that this user cannot write is only read."""
+    if os.access(path, os.W_OK):
+        return "mode=rw"
+    # Without a write-ahead log, SQLite would create one to read the database.
+    return "mode=ro" if os.path.exists(f"{path}-wal") else "mode=ro&immutable=1"
 
 
 def _identity(path: str) -> tuple[int, int] | None:

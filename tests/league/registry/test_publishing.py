@@ -23,7 +23,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest
 from league.registry.storage.tables import VersionTable
 from league.settings import Storage
-from tests.support.leagues.registries import GRAPH, LEAGUE, builder, leftovers, manifest, publish
+from tests.support.leagues.registries import GRAPH, LEAGUE, builder, leftovers, manifest, publish, registered
 
 
 def rows(registry: Registry) -> list[int]:
@@ -179,7 +179,7 @@ def readable() -> Iterator[Path]:
 def test_a_read_only_home_is_reported_in_one_line(readable: Path) -> None:
     fresh, used = readable / "fresh", readable / "used"
     fresh.mkdir()
-    Registry.open(Storage.at(used)).close()
+    registered(Registry.open(Storage.at(used))).close()
     for path in used.rglob("*"):
         path.chmod(0o444)
     for home in (fresh, used):

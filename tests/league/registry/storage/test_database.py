@@ -17,7 +17,7 @@ from league.registry.storage.database import Database
 from league.registry.storage.rows import HEARTBEAT_TIMEOUT, KeyRow, Record, RunRow
 from league.settings import Storage
 from tests.support.leagues.registries import LEAGUE, publish, registered
-from tests.support.small_disk import fill, small_disk
+from tests.support.small_disk import fill, read_only, small_disk
 
 
 def slugs(registry: Registry) -> list[str]:
@@ -62,6 +62,27 @@ def test_a_reader_creates_no_database(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match=r"league\.db does not exist"):
         Registry.open(Storage.at(tmp_path / "home"), create=False)
     assert not (tmp_path / "home").exists()
+
+
+def test_a_database_that_cannot_be_written_is_read(registry: Registry) -> None:
+    """Also with a write-ahead log: an open connection of another user."""
+    registered(registry)
+    home = registry.storage.home
+    for is_open in (True, False):
+        assert (home / "league.db-wal").exists() == is_open
+        with read_only(home):
+            reader = Registry.open(registry.storage)
+            assert slugs(reader) == [LEAGUE]
+            with pytest.raises(StorageError, match="attempt to write a readonly database"):
+                reader.leagues.archive(LEAGUE)
+            reader.close()
+        registry.close()
+
+
+def test_a_link_to_a_disk_that_is_not_mounted_is_called_so(tmp_path: Path) -> None:
+    (tmp_path / "home").symlink_to("/missing/disk")
+    with pytest.raises(StorageError, match=r"home cannot be used: it is a link to /missing/disk, which does not exist"):
+        Registry.open(Storage.at(tmp_path / "home"))
 
 
 def settings_of(url: str) -> tuple[dict[str, str], str, str]:
