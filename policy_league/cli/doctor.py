@@ -2,7 +2,7 @@
 
 import os
 import shutil
-import socket
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -13,13 +13,16 @@ from typing import Annotated
 import typer
 import yaml
 
-from league.errors import LeagueError, last_line
+from league.errors import ConfigError, LeagueError, last_line, one_line
+from league.interruption import ending_signals
 from league.ray_cluster import usable_cpus
 from league.settings import Storage
 from league.stack import OPTIONAL, VERIFIED, installed
+from policy_league.cli.options import UNNAMED, acting
 from policy_league.cli.output import emit, say, table
 
 GIGABYTE = 10**9
+LOOPBACK = "127.0.0.1"
 MINIMUM_DISK = 2 * GIGABYTE
 """A training run stores a few hundred MB of checkpoints, and Ray spills objects to disk."""
 LOW_SHARE = 0.1
@@ -104,16 +107,56 @@ def _accelerator() -> Iterator[Check]:
         yield Check("GPU", "ok", "none: training and serving use the CPU")
 
 
+def _user() -> Iterator[Check]:
+    if (name := acting(None)).startswith(UNNAMED):
+        yield Check("user", "note", name, "it has no name: --actor names who acts in histories")
+    else:
+        yield Check("user", "ok", name)
+    if (home := Path.home()) == Storage.from_environment().home:  # of `surroundings.complete`
+        yield Check("HOME", "note", "not set: LEAGUE_HOME is used")
+    elif os.access(home, os.W_OK):
+        yield Check("HOME", "ok", str(home))
+    else:
+        yield Check("HOME", "note", f"{home} is not writable", "set HOME if a library of your environment writes there")
+
+
+def _terminal() -> Iterator[Check]:
+    try:
+        "–█→".encode(sys.stdout.encoding)
+        yield Check("output", "ok", sys.stdout.encoding)
+    except UnicodeEncodeError:
+        advice = "set PYTHONIOENCODING=utf-8, else some characters are printed as ?"
+        yield Check("output", "note", sys.stdout.encoding, advice)
+    is_kept = signal.SIGHUP not in ending_signals()
+    yield Check("SIGHUP", "ok", "ignored, as after nohup" if is_kept else "ends commands like SIGTERM")
+
+
+def _proxies() -> Iterator[Check]:
+    import httpx
+
+    from policy_league_client.proxies import usable_proxies, variables
+
+    names = " and ".join(variables("http", "https", "all"))
+    try:
+        with usable_proxies():
+            httpx.Client().close()
+    except LeagueError as error:
+        yield Check("proxy", "note", one_line(error), "it is not used for this machine")
+        return
+    yield Check("proxy", "ok", f"that of {names}, except for this machine" if names else "none")
+
+
 def _home() -> Iterator[Check]:
     storage = Storage.from_environment()
     existing = next(path for path in (storage.home, *storage.home.parents) if path.exists())
-    writable = os.access(existing, os.W_OK)
-    yield Check(
-        "LEAGUE_HOME",
-        "ok" if writable else "fail",
-        str(storage.home),
-        "" if writable else "set LEAGUE_HOME to a writable directory",
-    )
+    status, advice = "ok", ""
+    if storage.home.is_symlink() and not storage.home.exists():
+        status, advice = "fail", f"it is a link to {storage.home.readlink()}, which does not exist: mount its disk"
+    elif not os.access(existing, os.W_OK):
+        status, advice = "fail", "set LEAGUE_HOME to a writable directory"
+        if existing == storage.home and os.access(existing, os.R_OK | os.X_OK):
+            status, advice = "note", "read only: nothing can be trained, evaluated, promoted or served"
+    yield Check("LEAGUE_HOME", status, str(storage.home), advice)
     yield _disk("disk", existing, "LEAGUE_HOME")
     if not isinstance(storage.artifacts, Path):
         return
@@ -195,17 +238,31 @@ def _haproxy() -> Iterator[Check]:
 
 
 def _ports() -> Iterator[Check]:
+    from serve_app.runtime.haproxy import is_free
     from serve_app.runtime.launch import DEPLOY_YAML
 
     document = yaml.safe_load(DEPLOY_YAML.read_text(encoding="utf-8"))
     for name, section, option in (("HTTP", "http_options", "--port"), ("gRPC", "grpc_options", "--grpc-port")):
         if section in document:
             port = document[section]["port"]
-            with socket.socket() as probe:
-                is_taken = probe.connect_ex(("127.0.0.1", port)) == 0
+            try:
+                is_taken = not is_free(LOOPBACK, port)
+            except ConfigError as error:
+                yield Check(f"serving {name}", "note", one_line(error), f"use `league serve {option} PORT`")
+                continue
             port_state = f"port {port} is {'in use' if is_taken else 'free'}"
             advice = f"unless this is your policy server, use `league serve {option} PORT`" if is_taken else ""
             yield Check(f"serving {name}", "note" if is_taken else "ok", port_state, advice)
+
+
+def _ipv6() -> Iterator[Check]:
+    from serve_app.runtime.haproxy import free_ports
+
+    try:
+        free_ports(1, "::1")
+        yield Check("IPv6", "ok", "`league serve --host ::1` and `--host ::` work")
+    except LeagueError as error:
+        yield Check("IPv6", "note", one_line(error), "serve IPv4 addresses only")
 
 
 CHECKS: tuple[Callable[[], Iterator[Check]], ...] = (
@@ -213,10 +270,14 @@ CHECKS: tuple[Callable[[], Iterator[Check]], ...] = (
     _stack,
     _processor,
     _accelerator,
+    _user,
+    _terminal,
+    _proxies,
     _home,
     _object_store,
     _registry,
     _ray,
     _haproxy,
     _ports,
+    _ipv6,
 )

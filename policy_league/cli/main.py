@@ -1,6 +1,5 @@
 """The `league` command: subcommands that are imported on demand, and the mapping of errors to exit codes."""
 
-import os
 import signal
 import sys
 from collections.abc import Iterator, Mapping
@@ -11,12 +10,13 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from league.errors import OWN_PACKAGES, InvalidInput, LeagueError, NotFound, one_line, raised_by
+from policy_league.cli import surroundings
 
 USAGE_ERROR = 2
 FAILURE = 1
 TERMINATED = 143
 """Exit code of a process ended by SIGTERM: 128 + 15."""
-ENDING = {"click", "typer", *OWN_PACKAGES}
+ENDING = {"click", "rich", "typer", *OWN_PACKAGES}
 """Packages that end a command."""
 
 
@@ -69,7 +69,9 @@ PANELS = {
         "void": Subcommand("evaluation.verdicts:void", "Void a verdict, whether its test is running or complete."),
     },
     "Versions": {
-        "versions": Subcommand("versions.listing:versions", "List a league's versions with their aliases and ratings."),
+        "versions": Subcommand(
+            "versions.listing:versions", "List a league's versions with their aliases and ratings, newest first."
+        ),
         "history": Subcommand("versions.aliases:history", "Show when and why an alias moved, and who moved it."),
         "note": Subcommand("versions.listing:note", "Set or clear the note of a version."),
         "import": Subcommand(
@@ -166,17 +168,18 @@ def _league() -> None:
 
 def run() -> None:
     """Run the command. A LeagueError becomes one line on stderr and exit code 2 (invalid input) or 1."""
-    # A league's `entry_point` may name a module in the working directory. Ray passes the path on to its workers. It is
-    # the last one, so that its files do not shadow installed packages.
-    sys.path.append(os.getcwd())
     try:
-        if "--json" in sys.argv:
-            from policy_league.cli.output import only_json_on_stdout
+        surroundings.complete()
+        try:
+            if "--json" in sys.argv:
+                from policy_league.cli.output import only_json_on_stdout
 
-            with only_json_on_stdout():
+                with only_json_on_stdout():
+                    app()
+            else:
                 app()
-        else:
-            app()
+        finally:
+            surroundings.flush()
     except LeagueError as error:
         from policy_league.cli.output import complain
 

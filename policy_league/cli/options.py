@@ -1,6 +1,8 @@
 """Arguments and options that several commands share, and the registry that they work on."""
 
 import gc
+import getpass
+import os
 from functools import cache
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,6 +32,8 @@ Timeout = Annotated[float, typer.Option(min=0, help="Maximum time for --wait, in
 Workers = Annotated[
     int, typer.Option(min=0, help="Number of Ray tasks that play games in parallel; 0 plays in this process.")
 ]
+UNNAMED = "uid "
+"""What precedes the number of a user without a name."""
 DEFAULT_SECONDS = 60.0
 Seconds = Annotated[
     float,
@@ -54,9 +58,20 @@ def workers_for(workers: int | None, address: str | None) -> int | None:
     return CORES if workers is None and address is None else workers
 
 
-def open_registry() -> "Registry":
-    """Open the registry of the environment variables. Imports SQLAlchemy."""
-    return _registry_class().open()
+def acting(actor: str | None) -> str:
+    """Return who acts: `actor`, or the current user, by number if it has no name, as in some containers."""
+    try:
+        return actor or getpass.getuser()
+    except (KeyError, OSError):
+        return f"{UNNAMED}{os.getuid()}"
+
+
+def open_registry(create: bool = True) -> "Registry":
+    """Open the registry of the environment variables. Imports SQLAlchemy.
+
+    create: create an SQLite database that does not exist.
+    """
+    return _registry_class().open(create=create)
 
 
 @cache

@@ -1,5 +1,6 @@
 """Output of the commands: text, tables, progress bars and JSON."""
 
+import json
 import re
 import sys
 import time
@@ -37,6 +38,8 @@ notes are untrusted: text after them could look like another one."""
 def emit(document: Any) -> None:
     """Print one JSON document and nothing else."""
     text = orjson.dumps(document, option=orjson.OPT_INDENT_2 | orjson.OPT_SERIALIZE_NUMPY).decode()
+    if (_documents or sys.stdout).encoding.lower() != "utf-8":
+        text = json.dumps(orjson.loads(text), indent=2)  # ASCII
     print(CONTROL.sub(lambda match: f"\\u{ord(match[0]):04x}", text), file=_documents, flush=True)
 
 

@@ -4,6 +4,7 @@ import ast
 import json
 import os
 import re
+import runpy
 import socket
 import subprocess
 import sys
@@ -45,6 +46,14 @@ def test_the_commands_are_complete() -> None:
         "retire", "import", "export", "exploitability", "list", "archive", "remove", "compare", "init", "runs",
         "mixture", "recount", "export-games", "search",
     }  # fmt: skip
+
+
+def test_the_package_is_the_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["league", "versions", "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_module("policy_league", run_name="__main__")
+    assert end.value.code == 0
+    assert "List a league's versions" in capsys.readouterr().out
 
 
 def test_each_command_and_option_has_help() -> None:

@@ -13,11 +13,11 @@ from policy_league.cli.options import (
     AsJson,
     ClusterWorkers,
     EvaluationCluster,
-    LeagueName,
     open_registry,
     workers_for,
 )
 from policy_league.cli.output import GameProgress, complain, emit, say, show_leaderboard, table
+from policy_league.configs.bundled import find
 
 if TYPE_CHECKING:
     from evaluation.documents import Estimate, EvaluationReport
@@ -66,7 +66,9 @@ Seed = Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Random seed. Anoth
 
 
 def evaluate(
-    league: LeagueName,
+    league: Annotated[
+        str, typer.Argument(metavar="LEAGUE|CONFIG", help="Name of the league, or YAML file, which is registered.")
+    ],
     refs: Refs = None,
     schedule: Schedule = ScheduleName.round_robin,
     against: Against = None,
@@ -87,13 +89,15 @@ def evaluate(
     """
     from evaluation.matches.tournament import evaluate as run
     from evaluation.schedules.tournament_plan import Budget
+    from league.config.league import LeagueConfig
     from league.ray_cluster import ray_session
 
     Storage.from_environment().export()
     registry = open_registry()
+    is_file = league.endswith((".yaml", ".yml"))
     with ray_session(address), GameProgress(quiet=as_json) as listener:
         report = run(
-            check_slug("league", league),
+            LeagueConfig.load(find(league)) if is_file else check_slug("league", league),
             refs or (),
             registry=registry,
             schedule=schedule.value,

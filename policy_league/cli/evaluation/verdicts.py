@@ -1,11 +1,10 @@
 """`league verify` and `league void`."""
 
-import getpass
 from typing import Annotated
 
 import typer
 
-from policy_league.cli.options import Actor, AsJson, open_registry
+from policy_league.cli.options import Actor, AsJson, acting, open_registry
 from policy_league.cli.output import counted, emit, say
 
 Verdict = Annotated[
@@ -56,7 +55,7 @@ def void(
 
     registry = open_registry()
     before = registry.verdicts.find(verdict)
-    row = run(registry, verdict, actor=actor or getpass.getuser(), reason=reason, purge=purge)
+    row = run(registry, verdict, actor=acting(actor), reason=reason, purge=purge)
     subject = f"Verdict {row.short_id} on {row.league}@{row.candidate}"
     if before.outcome == VOID:
         say(f"{subject} was already void, {(before.evidence or {}).get('note')}. The first reason is kept.")

@@ -10,7 +10,15 @@ from typing import Annotated, Any
 import orjson
 import typer
 
-from league.errors import ConfigError, InvalidInput, InvalidReference, RemoteError
+from league.errors import (
+    ConfigError,
+    InvalidInput,
+    InvalidReference,
+    RemoteError,
+    StorageError,
+    UnknownLeague,
+    one_line,
+)
 from league.refs import CHAMPION, CheckpointRef, PolicyRef, RemoteRef, ScriptRef, parse_ref
 from policy_league.cli.options import DEFAULT_URL, MAX_SEED, open_registry
 from policy_league.cli.output import emit, say
@@ -55,19 +63,29 @@ def act(
         parsed, policy = CheckpointRef(model.league, CHAMPION), policy or model.policy
     if not isinstance(parsed, CheckpointRef):
         raise InvalidReference(f"{ref} is not a version. Only versions can be served, such as connect_four@champion")
-    if observation is None:
-        from evaluation.playback.single_game import first_observation
-
-        league = open_registry().leagues.get(parsed.league)
-        value = first_observation(league.config, league.interface, policy)
-    else:
-        value = _read(observation)
+    value = _first_observation(parsed.league, policy, local) if observation is None else _read(observation)
     options = {"explore": explore, "seed": seed, "deadline_ms": deadline_ms, "analysis": analysis}
     response = _act_here(parsed, policy, value, options) if local else _ask(parsed, policy, value, options, url)
     if as_json or analysis:
         emit(response)
     else:
         say(str(response["action"]))
+
+
+def _first_observation(league: str, policy: str | None, local: bool) -> Any:
+    """The first observation of a new episode, which requires the league's environment on this machine."""
+    from evaluation.playback.single_game import first_observation
+
+    try:
+        row = open_registry(create=local).leagues.get(league)
+    except (StorageError, UnknownLeague) as error:
+        if local:
+            raise
+        raise InvalidInput(
+            f"pass --observation: the first one of an episode can be computed only where the league is, and"
+            f" {one_line(error)}"
+        ) from error
+    return first_observation(row.config, row.interface, policy)
 
 
 def _ask(ref: CheckpointRef, policy: str | None, value: Any, options: dict[str, Any], url: str) -> dict[str, Any]:

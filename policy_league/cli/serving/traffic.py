@@ -1,6 +1,5 @@
 """`league traffic`: canary and shadow versions of a league."""
 
-import getpass
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,7 +7,7 @@ import typer
 
 from league.errors import InvalidInput
 from league.refs import CheckpointRef, check_slug, parse_version
-from policy_league.cli.options import Actor, AsJson, LeagueName, Reason, Timeout, open_registry
+from policy_league.cli.options import Actor, AsJson, LeagueName, Reason, Timeout, acting, open_registry
 from policy_league.cli.output import emit, say, table
 
 if TYPE_CHECKING:
@@ -73,7 +72,7 @@ def traffic(
         league,
         canary=None if off else _portion(league, "--canary", canary, share, current.canary, CANARY_SHARE),
         shadow=None if off else _portion(league, "--shadow", shadow, shadow_share, current.shadow, SHADOW_SHARE),
-        actor=actor or getpass.getuser(),
+        actor=acting(actor),
         reason=reason,
     )
     replicas = registry.changes.wait_for_traffic(setting, timeout) if wait else None

@@ -1,6 +1,5 @@
 """`league promote`, `mixture`, `rollback` and `history`."""
 
-import getpass
 import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -18,7 +17,7 @@ from league.refs import (
     parse_mixture,
     short_verdict,
 )
-from policy_league.cli.options import Actor, AsJson, LeagueName, Reason, Timeout, open_registry
+from policy_league.cli.options import Actor, AsJson, LeagueName, Reason, Timeout, acting, open_registry
 from policy_league.cli.output import confirm, counted, emit, say, table
 
 if TYPE_CHECKING:
@@ -76,7 +75,7 @@ def promote(
         alias,
         version.number,
         expected=before,
-        actor=actor or getpass.getuser(),
+        actor=acting(actor),
         reason=reason,
     )
     _moved(event, current, as_json, registry.changes.wait_for_alias(event, timeout) if wait else None)
@@ -210,7 +209,7 @@ def rollback(
     event = registry.aliases.rollback(
         check_slug("league", league),
         expected=ANY if expected is None else expected,
-        actor=actor or getpass.getuser(),
+        actor=acting(actor),
         reason=reason,
     )
     _moved(event, event.previous, as_json, registry.changes.wait_for_alias(event, timeout) if wait else None)

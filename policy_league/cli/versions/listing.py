@@ -1,6 +1,5 @@
 """`league versions` and `league note`."""
 
-import getpass
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,23 +9,38 @@ from league.refs import (
     CheckpointRef,
     check_slug,
 )
-from policy_league.cli.options import Actor, AsJson, LeagueName, open_registry
+from policy_league.cli.options import Actor, AsJson, LeagueName, acting, open_registry
 from policy_league.cli.output import elo, emit, say, table, warn_of_changed_game
 
 if TYPE_CHECKING:
     from league.registry.registry import Registry
     from league.registry.storage.rows import VersionRow
 
+SHOWN = 20
+"""Number of versions in a table."""
+
 Ref = Annotated[str, typer.Argument(metavar="REF", help="Version, such as connect_four@3.")]
 
 
-def versions(league: LeagueName, as_json: AsJson = False) -> None:
-    """List a league's versions with their aliases and ratings.
+def versions(
+    league: LeagueName,
+    limit: Annotated[
+        int | None, typer.Option(min=1, help="Maximum number of versions. Default: 20; with --json all, oldest first.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List a league's versions with their aliases and ratings, newest first.
 
     Ratings are Elo relative to `script:random` with 95 % intervals, from all recorded matches; – means not rated yet.
     """
     registry = open_registry()
-    rows = registry.versions.all(check_slug("league", league))
+    check_slug("league", league)
+    if as_json and limit is None:
+        rows, older = registry.versions.all(league), []
+    else:
+        limit = limit or SHOWN
+        newest = registry.versions.newest(league, limit=limit + 1)
+        rows, older = newest[:limit], newest[limit:]
     rated = _ratings(registry, league)
     documents = [_document(row, rated.get(row.ref, {})) for row in rows]
     if as_json:
@@ -54,6 +68,8 @@ def versions(league: LeagueName, as_json: AsJson = False) -> None:
         prose=("note",),
         optional=("role", "parent", "note"),
     )
+    if older:
+        say(f"Older versions are not shown: --limit, now {limit}.")
     if rated:
         warn_of_changed_game(registry, league)
 
@@ -108,5 +124,5 @@ def note(
 
     Notes are shown by `league versions` and on the web pages. The new text replaces the previous one.
     """
-    row = open_registry().versions.set_note(CheckpointRef.parse(ref), text, actor=actor or getpass.getuser())
+    row = open_registry().versions.set_note(CheckpointRef.parse(ref), text, actor=acting(actor))
     say(f"{row.ref}: {row.note.text if row.note else 'note cleared'}")

@@ -1,12 +1,11 @@
 """`league search`: publishes a version that looks ahead."""
 
-import getpass
 from typing import Annotated, Literal
 
 import typer
 
 from league.refs import CheckpointRef
-from policy_league.cli.options import Actor, AsJson, open_registry
+from policy_league.cli.options import Actor, AsJson, acting, open_registry
 from policy_league.cli.output import emit, say
 
 
@@ -38,9 +37,7 @@ def search(
     league = registry.leagues.follow_code(base.league, interface)
     version = publish_search(registry, base, league.config.environment, league.interface, rule, simulations)
     if note is not None:
-        version = registry.versions.set_note(
-            CheckpointRef(version.league, version.number), note, actor=actor or getpass.getuser()
-        )
+        version = registry.versions.set_note(CheckpointRef(version.league, version.number), note, actor=acting(actor))
     if as_json:
         emit(
             {

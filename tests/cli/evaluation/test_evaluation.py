@@ -54,6 +54,15 @@ def test_evaluations_are_printed_as_json_and_as_tables(league: League, registry:
     assert document["population"] is None
 
 
+def test_a_file_names_its_league(league: League, home: Path, tmp_path: Path) -> None:
+    """It is registered, as by `league train` and `league nightly`."""
+    config = tmp_path / "own.yaml"
+    config.write_text("league: own\nenvironment: {entry_point: pettingzoo.classic.tictactoe_v3}\n")
+    document = league("evaluate", str(config), "--blocks", "1", "--workers", "0", "--json").json
+    assert (document["league"], document["games"]) == ("own", 2)
+    assert "own" in Registry.open(Storage.at(home)).leagues.names()
+
+
 @pytest.mark.slow
 def test_a_terminated_evaluation_exits_like_any_terminated_process(registry: Registry, home: Path) -> None:
     """Also once Ray has set its handler."""

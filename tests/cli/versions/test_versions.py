@@ -43,8 +43,14 @@ def test_versions_are_listed_with_their_aliases_and_notes(league: League, regist
     notes = [version["note"] for version in document["versions"]]
     assert [note and (note["text"], note["actor"]) for note in notes] == [None, ("[bold]entropy", "ada"), None]
     lines = league("versions", "tictactoe").out.splitlines()
-    assert (lines[0].split()[:3], len(lines)) == (["version", "aliases", "rating"], 4)
+    assert lines[0].split()[:3] == ["version", "aliases", "rating"]
+    assert [line.split()[0] for line in lines[1:]] == ["3", "2", "1"]
     assert lines[2].endswith("[bold]entropy")
+    lines = league("versions", "tictactoe", "--limit", "2").out.splitlines()
+    assert [line.split()[0] for line in lines[1:3]] == ["3", "2"]
+    assert lines[3] == "Older versions are not shown: --limit, now 2."
+    document = league("versions", "tictactoe", "--limit", "1", "--json").json
+    assert [version["version"] for version in document["versions"]] == [3]
     assert league("note", "tictactoe@2", "").out == "tictactoe@2: note cleared\n"
     assert registry.versions.get("tictactoe", 2).note is None
 
