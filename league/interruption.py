@@ -6,6 +6,7 @@ import stat
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 _last_signal = signal.SIGINT
 
@@ -16,8 +17,13 @@ def ending_signals() -> tuple[signal.Signals, ...]:
     return (signal.SIGINT, signal.SIGTERM) if is_kept else (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
+def interrupt() -> NoReturn:
+    """Raise KeyboardInterrupt, which leaves no environment open and no file half-written."""
+    raise KeyboardInterrupt
+
+
 @contextmanager
-def on_ending_signals(handle: Callable[[], None]) -> Iterator[None]:
+def on_ending_signals(handle: Callable[[], None] = interrupt) -> Iterator[None]:
     """Call `handle` at each signal that ends a command, and restore the former handlers at the end of the block.
 
     Does nothing outside the main thread, where Python cannot handle signals.
@@ -64,5 +70,5 @@ def hangup_blocked() -> Iterator[None]:
 
 
 def exit_code() -> int:
-    """Return the exit code of a command that a signal ended: 128 and its number, 130 for Ctrl-C."""
+    """Return the exit code of a command that a signal ended: 128 and its number, 130 for Ctrl-C or without a signal."""
     return 128 + _last_signal

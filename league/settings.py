@@ -23,7 +23,10 @@ class Storage:
     @classmethod
     def at(cls, home: Path | str) -> "Storage":
         """Return a SQLite database and an artefact directory inside `home`."""
-        home = Path(home).expanduser().absolute()
+        try:
+            home = Path(home).expanduser().absolute()
+        except RuntimeError as error:
+            raise ConfigError(f"{home}: this user has no home directory: use an absolute path") from error
         # In URLs, a query begins with ? and an escape sequence with %.
         database = str(home / "league.db").replace("%", "%25").replace("?", "%3F")
         return cls(home, f"sqlite:///{database}", home / "artifacts")

@@ -1,6 +1,5 @@
 """`league demo`: train, evaluate, promote and serve Connect Four, with explanations."""
 
-import signal
 import threading
 from contextlib import closing
 from typing import TYPE_CHECKING, Annotated
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.rule import Rule
 
+from league.interruption import on_ending_signals
 from league.settings import Storage
 from policy_league.cli.options import DEFAULT_URL, open_registry
 from policy_league.cli.output import console, say
@@ -61,9 +61,8 @@ def demo(
             _show_next_steps(config.league, url)
             say("Serving until Ctrl-C.")
             stop = threading.Event()
-            for name in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(name, lambda *_: stop.set())
-            stop.wait()
+            with on_ending_signals(stop.set):
+                stop.wait()
             say("\nStopping.")
 
 

@@ -10,12 +10,13 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from league.errors import OWN_PACKAGES, InvalidInput, LeagueError, NotFound, one_line, raised_by
+from league.interruption import exit_code, on_ending_signals
 from policy_league.cli import surroundings
 
 USAGE_ERROR = 2
 FAILURE = 1
-TERMINATED = 143
-"""Exit code of a process ended by SIGTERM: 128 + 15."""
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+"""Exit codes of commands that a signal ended. Typer's code for any KeyboardInterrupt is the first one."""
 ENDING = {"click", "rich", "typer", *OWN_PACKAGES}
 """Packages that end a command."""
 
@@ -171,13 +172,14 @@ def run() -> None:
     try:
         surroundings.complete()
         try:
-            if "--json" in sys.argv:
-                from policy_league.cli.output import only_json_on_stdout
+            with on_ending_signals():
+                if "--json" in sys.argv:
+                    from policy_league.cli.output import only_json_on_stdout
 
-                with only_json_on_stdout():
+                    with only_json_on_stdout():
+                        app()
+                else:
                     app()
-            else:
-                app()
         finally:
             surroundings.flush()
     except LeagueError as error:
@@ -186,6 +188,8 @@ def run() -> None:
         complain(f"league: {one_line(error)}")
         sys.exit(USAGE_ERROR if isinstance(error, InvalidInput | NotFound) else FAILURE)
     except SystemExit as end:
+        if end.code == INTERRUPTED:
+            sys.exit(exit_code())
         if end.code == signal.SIGTERM:  # Ray's handler exits with the number of the signal.
             sys.exit(TERMINATED)
         package, place = raised_by(end)

@@ -55,15 +55,15 @@ def complete() -> None:
             stream = open(os.devnull, mode)  # noqa: SIM115  open until the process ends
             os.set_inheritable(stream.fileno(), True)
             setattr(sys, name, stream)
-    if os.path.expanduser("~") == "~":
-        # Ray looks for files in the home directory when it is imported.
-        os.environ["HOME"] = str(Storage.from_environment().home)
     try:
         # A league's `entry_point` may name a module in the working directory. Ray passes the path on to its workers. It
         # is the last one, so that its files do not shadow installed packages.
         sys.path.append(os.getcwd())
     except FileNotFoundError as error:
         raise ConfigError("the working directory was removed: change to another one") from error
+    if os.path.expanduser("~") == "~":
+        # Ray looks for files in the home directory when it is imported.
+        os.environ["HOME"] = str(Storage.from_environment().home)
 
 
 def flush() -> None:

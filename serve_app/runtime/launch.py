@@ -95,7 +95,7 @@ def serve_forever(
     _check_exposure(document, storage)
     storage.export()
     try:
-        with on_ending_signals(_interrupt):
+        with on_ending_signals():
             if address is None:
                 _serve_locally(document, dashboard, on_ready)
             else:
@@ -313,7 +313,7 @@ def _deploy(document: dict[str, Any], on_ready: OnReady | None, dashboard: str |
     except ValidationError as error:
         raise ConfigError(f"deploy.yaml: {one_line(error)}") from error
     logging.getLogger("ray.serve").setLevel(logging.ERROR)  # this process only: the others log to files
-    with on_ending_signals(_interrupt):  # ray.init has replaced the handlers
+    with on_ending_signals():  # ray.init has replaced the handlers
         ray_serve.deploy(schema)
         host, port = str(schema.http_options.host), schema.http_options.port
         (application,) = schema.applications
@@ -362,10 +362,6 @@ def _errors_of_ray() -> Iterator[None]:
         yield
     except (ray.exceptions.RayError, TimeoutError) as error:
         raise NotReady(f"Ray Serve did not start: {last_line(str(error))}") from error
-
-
-def _interrupt() -> NoReturn:
-    raise KeyboardInterrupt
 
 
 def _await_url(server: Subprocess, log: IO[bytes], timeout: float) -> str:

@@ -5,9 +5,11 @@ import json
 import os
 import re
 import runpy
+import signal
 import socket
 import subprocess
 import sys
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from io import StringIO
 from pathlib import Path
@@ -22,6 +24,7 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from evaluation.documents import Progress
+from league import interruption
 from league.histograms import Histogram
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
@@ -145,6 +148,23 @@ def test_code_of_a_user_does_not_end_a_command_silently(
         main.run()
     assert end.value.code == 1
     assert re.fullmatch(rf"league: {re.escape(__file__)}, line \d+ called sys\.exit\(\)\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_a_command_in_order(
+    number: signal.Signals, league: League, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(interruption, "_last_signal", signal.SIGINT)
+    closed: list[str] = []
+
+    def interrupted() -> None:
+        with ExitStack() as stack:
+            stack.callback(closed.append, "environment")
+            signal.raise_signal(number)
+
+    monkeypatch.setattr("policy_league.cli.leagues.listing.open_registry", interrupted)
+    result = league("list")
+    assert (result.code, result.out, result.err.strip(), closed) == (128 + number, "", "", ["environment"])
 
 
 @pytest.fixture

@@ -112,6 +112,13 @@ def test_a_user_without_a_name_acts_and_has_a_home(registry: Registry, home: Pat
 
 
 @pytest.mark.usefixtures("nameless")
+def test_a_path_in_an_unknown_home(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("LEAGUE_HOME", "~/league")
+    assert code_of("list") == 2
+    assert capsys.readouterr().err == "league: ~/league: this user has no home directory: use an absolute path\n"
+
+
+@pytest.mark.usefixtures("nameless")
 def test_doctor_names_what_the_surroundings_lack(league: League, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ALL_PROXY", "unknown://127.0.0.1")
     monkeypatch.setattr(doctor, "CHECKS", (doctor._user, doctor._terminal, doctor._proxies, doctor._home))
