@@ -9,6 +9,8 @@ from io import TextIOWrapper
 from league.errors import ConfigError, StorageError
 from league.settings import Storage
 
+THIS_MACHINE = "localhost,127.0.0.1,::1"
+
 
 class Output(TextIOWrapper):
     """Standard output whose errors are StorageErrors, unless its reader has ended (BrokenPipeError)."""
@@ -40,7 +42,8 @@ def _translated() -> Iterator[None]:
 
 
 def complete() -> None:
-    """Supply what is missing: open streams, an encoding for all text, an import path, a home directory.
+    """Supply what is missing: open streams, an encoding for all text, an import path, a home directory, and for all
+    libraries the rule that no proxy reaches this machine.
 
     Raises ConfigError without a working directory.
     """
@@ -55,6 +58,8 @@ def complete() -> None:
             stream = open(os.devnull, mode)  # noqa: SIM115  open until the process ends
             os.set_inheritable(stream.fileno(), True)
             setattr(sys, name, stream)
+    name = "no_proxy" if "no_proxy" in os.environ else "NO_PROXY"
+    os.environ[name] = ",".join(filter(None, (os.environ.get(name), THIS_MACHINE)))
     try:
         # A league's `entry_point` may name a module in the working directory. Ray passes the path on to its workers. It
         # is the last one, so that its files do not shadow installed packages.

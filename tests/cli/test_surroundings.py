@@ -5,7 +5,10 @@ import json
 import os
 import pwd
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
+from urllib.request import proxy_bypass
 
 import pytest
 
@@ -19,14 +22,15 @@ DASH = "–"
 
 
 @pytest.fixture
-def streams(home: Path, monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+def streams(home: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     """The command runs in this process; what it changes is restored."""
     monkeypatch.setenv("LEAGUE_HOME", str(home))
     monkeypatch.setattr(sys, "path", list(sys.path))
     for name in ("argv", "stdin", "stdout", "stderr"):
         monkeypatch.setattr(sys, name, getattr(sys, name))
     monkeypatch.setattr(output.console, "quiet", False)  # as Rich sets it when a reader has ended
-    return monkeypatch
+    with mock.patch.dict(os.environ):
+        yield monkeypatch
 
 
 def code_of(*arguments: str) -> int:
@@ -88,6 +92,19 @@ def test_a_working_directory_that_was_removed(
     (tmp_path / "removed").rmdir()
     assert code_of("list") == 2
     assert capsys.readouterr().err == "league: the working directory was removed: change to another one\n"
+
+
+@pytest.mark.usefixtures("registry", "streams")
+def test_no_library_uses_a_proxy_for_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("NO_PROXY", "no_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NO_PROXY", "")
+    assert code_of("list") == 0
+    assert all(map(proxy_bypass, ("localhost", "127.0.0.1", "::1")))
+    assert not proxy_bypass("models.example")
+    monkeypatch.setenv("no_proxy", "models.example")
+    assert code_of("list") == 0
+    assert all(map(proxy_bypass, ("models.example", "127.0.0.1")))
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from evaluation.matches.tournament import play_schedule
 from evaluation.matches.worker import MatchWorker, match_worker
 from evaluation.schedules.builders import round_robin
 from league.config.league import LeagueConfig
+from league.environments import building
 from league.environments.building import interface
 from league.errors import GameCrashed
 from league.registry.registry import Registry
@@ -40,6 +41,7 @@ def schedule_of(registry: Registry, config: LeagueConfig, blocks: int = 12) -> S
 
 def test_environments_are_closed_at_the_end_of_a_schedule(registry: Registry, caplog: pytest.LogCaptureFixture) -> None:
     """Also if it ends early. What `close` raises is logged once for all copies."""
+    building._log_once.cache_clear()
     schedule = schedule_of(registry, settings(closes="raises"))
     running: list[int] = []
 
