@@ -1,7 +1,7 @@
 """`league demo`: train, evaluate, promote and serve Connect Four, with explanations."""
 
 import threading
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -60,9 +60,8 @@ def demo(
         else:
             _show_next_steps(config.league, url)
             say("Serving until Ctrl-C.")
-            stop = threading.Event()
-            with on_ending_signals(stop.set):
-                stop.wait()
+            with on_ending_signals(), suppress(KeyboardInterrupt):
+                threading.Event().wait()
             say("\nStopping.")
 
 
