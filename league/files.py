@@ -27,7 +27,7 @@ def disk_errors(path: Path, only: tuple[int, ...] | None = None, action: str = "
         if only is not None and error.errno not in only:
             raise
         name, reason = Path(error.filename or path), error.strerror or str(error)
-        if isinstance(error, FileExistsError) and name.is_symlink() and not name.exists():
+        if isinstance(error, FileExistsError | FileNotFoundError) and name.is_symlink() and not name.exists():
             reason = f"it is a link to {name.readlink()}, which does not exist"
         raise StorageError(f"{name} cannot be {action}: {reason}") from error
 

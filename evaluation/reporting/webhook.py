@@ -8,7 +8,8 @@ import httpx
 
 from evaluation.gating.nightly import NightlyReport
 from league.errors import ConfigError, RemoteError, one_line
-from policy_league_client.proxies import is_loopback, usable_proxies
+from policy_league_client.loopback import is_loopback
+from policy_league_client.proxies import usable_proxies
 
 ATTEMPTS = 3
 SECONDS = 10.0

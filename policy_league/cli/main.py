@@ -188,8 +188,8 @@ def run() -> None:
         complain(f"league: {one_line(error)}")
         sys.exit(USAGE_ERROR if isinstance(error, InvalidInput | NotFound) else FAILURE)
     except SystemExit as end:
-        if end.code == INTERRUPTED:
-            sys.exit(exit_code())
+        if end.code == INTERRUPTED or (not end.code and exit_code() != INTERRUPTED):
+            sys.exit(exit_code())  # also of a command that has ended in order, such as a server
         if end.code == signal.SIGTERM:  # Ray's handler exits with the number of the signal.
             sys.exit(TERMINATED)
         package, place = raised_by(end)

@@ -2,8 +2,8 @@
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from io import TextIOWrapper
 
 from league.errors import ConfigError, StorageError
@@ -12,22 +12,24 @@ from league.settings import Storage
 THIS_MACHINE = "localhost,127.0.0.1,::1"
 
 
-class Output(TextIOWrapper):
-    """Standard output whose errors are StorageErrors, unless its reader has ended (BrokenPipeError)."""
+class Stream(TextIOWrapper):
+    """Standard output or standard error. Characters that its encoding lacks are replaced."""
 
-    def __init__(self, original: TextIOWrapper) -> None:
-        """Replace characters that the encoding of the original stream lacks."""
+    def __init__(self, original: TextIOWrapper, handled: Callable[[], AbstractContextManager[None]]) -> None:
+        """handled: the context of each write, which handles OSErrors."""
         super().__init__(original.buffer, original.encoding, "replace", line_buffering=original.line_buffering)
         self._original = original  # which would close the buffer at its end
+        self._handled = handled
 
     def write(self, text: str) -> int:
         """Write text to the buffer."""
-        with _translated():
-            return super().write(text)
+        with self._handled():
+            super().write(text)
+        return len(text)
 
     def flush(self) -> None:
         """Write the buffer."""
-        with _translated():
+        with self._handled():
             super().flush()
 
 
@@ -35,10 +37,14 @@ class Output(TextIOWrapper):
 def _translated() -> Iterator[None]:
     try:
         yield
-    except BrokenPipeError:
+    except BrokenPipeError:  # its reader has ended
         raise
     except OSError as error:
         raise StorageError(f"standard output cannot be written: {error.strerror}") from error
+
+
+def _ignored() -> AbstractContextManager[None]:
+    return suppress(OSError)  # there is nowhere to say it
 
 
 def complete() -> None:
@@ -47,10 +53,10 @@ def complete() -> None:
 
     Raises ConfigError without a working directory.
     """
+    if type(sys.stdout) is TextIOWrapper:
+        sys.stdout = Stream(sys.stdout, _translated)
     if type(sys.stderr) is TextIOWrapper:
-        sys.stderr.reconfigure(errors="replace")
-    if type(stdout := sys.stdout) is TextIOWrapper:
-        sys.stdout = Output(stdout)
+        sys.stderr = Stream(sys.stderr, _ignored)
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             # It takes the lowest free descriptor, that of the closed stream. Otherwise a database would take it, and

@@ -10,8 +10,8 @@ A page of another site cannot set the headers that carry an API key, but it coul
 
 from collections.abc import Collection, Iterable
 from functools import lru_cache
-from ipaddress import ip_address
 
+from policy_league_client.loopback import is_loopback
 from serve_app.access.errors import CrossSiteRequest, UntrustedHost
 
 ORIGIN_HEADERS = frozenset((b"sec-fetch-site", b"origin"))
@@ -63,9 +63,4 @@ def reject_foreign_host(headers: Iterable[tuple[bytes, bytes]]) -> None:
 def _is_loopback(authority: bytes) -> bool:
     host = authority.decode("latin-1").lower()
     host = host[1 : host.find("]")] if host.startswith("[") else host.partition(":")[0]
-    if host == "localhost" or host.endswith(".localhost"):  # never resolved by DNS (RFC 6761)
-        return True
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return is_loopback(host)

@@ -6,6 +6,7 @@ import os
 import pwd
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from unittest import mock
 from urllib.request import proxy_bypass
@@ -48,6 +49,16 @@ def test_a_full_disk_behind_stdout(arguments: tuple[str, ...], capsys: pytest.Ca
     with Path("/dev/full").open("w", encoding="utf-8") as sys.stdout:
         assert code_of(*arguments) == 1
     assert capsys.readouterr().err == "league: standard output cannot be written: No space left on device\n"
+
+
+@pytest.mark.usefixtures("registry", "streams")
+def test_a_full_disk_behind_stderr_changes_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    full = sys.stderr = os.fdopen(os.open("/dev/full", os.O_WRONLY), "w", encoding="utf-8")
+    assert code_of("versions", "unknown") == 2
+    assert code_of("list") == 0
+    assert "tictactoe" in capsys.readouterr().out
+    with suppress(OSError):
+        full.close()
 
 
 @pytest.mark.usefixtures("registry", "streams")

@@ -5,7 +5,8 @@ import os
 import pytest
 
 from league.errors import InvalidInput, LeagueError, RemoteError
-from policy_league_client.proxies import is_loopback, through_proxy
+from policy_league_client.loopback import is_loopback
+from policy_league_client.proxies import through_proxy
 from tests.support.clients.sync_and_async import Connect
 
 DEAD = "http://127.0.0.1:9"

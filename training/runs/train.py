@@ -83,8 +83,8 @@ def train(
     a runner is lost, provided that it has published a version since it began or was last continued. If a node is
     drained, or nodes join that make it faster, its state is published and it continues from there.
 
-    The first SIGINT or SIGTERM saves and publishes the current state, and raises Interrupted. A second one raises
-    KeyboardInterrupt immediately. The run can be resumed in both cases.
+    The first SIGINT, SIGTERM or SIGHUP saves and publishes the current state, and raises Interrupted. A second one
+    raises KeyboardInterrupt immediately. The run can be resumed in both cases.
 
     Args:
         config: The league.

@@ -104,7 +104,7 @@ def sweep(
     Each trial is trained as `train` does, with its own settings; only the best one is published. TensorBoard files are
     in `<home>/sweeps/<league>/<sweep>`.
 
-    The first SIGINT or SIGTERM lets the trials save and ends the sweep without publishing. A second one raises
+    The first SIGINT, SIGTERM or SIGHUP lets the trials save and ends the sweep without publishing. A second one raises
     KeyboardInterrupt immediately. The sweep can be resumed in both cases.
 
     Args:

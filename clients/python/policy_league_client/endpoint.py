@@ -8,7 +8,8 @@ import httpx
 
 from policy_league_client.calls import ApiCall
 from policy_league_client.errors import InvalidInput, RemoteError, one_line
-from policy_league_client.proxies import is_loopback, through_proxy, usable_proxies
+from policy_league_client.loopback import is_loopback
+from policy_league_client.proxies import through_proxy, usable_proxies
 from policy_league_client.retries import Outcome, parse_error, parse_object
 
 C = TypeVar("C", httpx.Client, httpx.AsyncClient)

@@ -3,20 +3,12 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from ipaddress import ip_address
 from urllib.request import proxy_bypass
 
 import httpx
 
 from policy_league_client.errors import InvalidInput, one_line
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether a host is this machine: `localhost`, `127.0.0.1`, `::1`."""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost" or host.endswith(".localhost")
+from policy_league_client.loopback import is_loopback
 
 
 def through_proxy(url: str) -> str:
@@ -33,7 +25,8 @@ def usable_proxies() -> Iterator[None]:
     try:
         yield
     except (ImportError, ValueError, httpx.InvalidURL) as error:
-        names = " or ".join(variables("http", "https", "all"))
+        if not (names := " or ".join(variables("http", "https", "all"))):
+            raise
         raise InvalidInput(f"the proxy that {names} names cannot be used: {one_line(error)}") from error
 
 

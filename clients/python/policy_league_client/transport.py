@@ -12,7 +12,8 @@ from websockets.asyncio.client import connect as _async_connect
 from websockets.sync.client import ClientConnection as _Connection
 from websockets.sync.client import connect as _connect
 
-from policy_league_client.proxies import is_loopback, usable_proxies
+from policy_league_client.loopback import is_loopback
+from policy_league_client.proxies import usable_proxies
 
 CLOSE_TIMEOUT = 1.0
 """Seconds that a server has to confirm the end of a WebSocket connection."""

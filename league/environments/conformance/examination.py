@@ -7,7 +7,7 @@ import contextlib
 import io
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
@@ -26,6 +26,8 @@ from league.environments.vector.measurement import steps_per_second
 from league.errors import InvalidReturn, LeagueError, cause, no_exit, one_line, raised_at
 from league.interface import Interface
 from league.spaces import Box, Discrete, MultiDiscrete
+
+T = TypeVar("T")
 
 CYCLES = 50
 """Number of cycles of PettingZoo's API tests."""
@@ -61,15 +63,12 @@ def examine(
         The findings, with the lengths of the episodes, the speed and the effect of random openings.
     """
     examination, budget = Examination(), TimeBudget(seconds, progress)
-    try:
-        with no_exit:
-            examination.implementation = implementation(config.environment).reason
-            env = build(config.environment)
-    except LeagueError as error:
-        examination.add("fault", str(error))
+    consequence = f"{config.environment.entry_point} cannot be created"
+    reason = _attempt(lambda: implementation(config.environment).reason, examination, consequence)
+    if reason is None:
         return examination
-    except Exception as error:
-        examination.add("fault", f"{config.environment.entry_point} cannot be created{cause(error)}")
+    examination.implementation = reason
+    if (env := _attempt(lambda: build(config.environment), examination, consequence)) is None:
         return examination
     try:
         interface = _described(env, config, examination)
@@ -95,16 +94,24 @@ def examine(
     return examination
 
 
-def _described(env: Any, config: LeagueConfig, examination: Examination) -> Interface | None:
-    """Record the interface of an environment. Returns it if episodes can be played, else None."""
+def _attempt(call: Callable[[], T], examination: Examination, consequence: str) -> T | None:
+    """Return the result of a call. What it raises is recorded as a fault; an exception of a user's code follows
+    `consequence`.
+    """
     try:
         with no_exit:
-            interface = describe(env, config)
+            return call()
     except LeagueError as error:
         examination.add("fault", str(error))
-        return None
     except Exception as error:
-        examination.add("fault", f"{config.environment.entry_point} cannot be described{cause(error)}")
+        examination.add("fault", f"{consequence}{cause(error)}")
+    return None
+
+
+def _described(env: Any, config: LeagueConfig, examination: Examination) -> Interface | None:
+    """Record the interface of an environment. Returns it if episodes can be played, else None."""
+    consequence = f"{config.environment.entry_point} cannot be described"
+    if (interface := _attempt(lambda: describe(env, config), examination, consequence)) is None:
         return None
     examination.api = (
         "AEC" if isinstance(env, AECEnv) else "Parallel" if isinstance(env, ParallelEnv) else "MultiAgentEnv"

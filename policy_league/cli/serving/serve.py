@@ -1,11 +1,9 @@
 """`league serve`."""
 
-import signal
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from league.interruption import exit_code
 from league.refs import CHAMPION
 from league.settings import Storage
 from policy_league.cli.options import DEFAULT_URL, open_registry
@@ -13,9 +11,6 @@ from policy_league.cli.output import say
 
 if TYPE_CHECKING:
     from league.registry.registry import Registry
-
-INTERRUPTED = 128 + signal.SIGINT
-"""Ctrl-C is the usual end of a server, and no failure."""
 
 
 def serve(
@@ -76,8 +71,6 @@ def serve(
             + "Stop: Ctrl-C"
         ),
     )
-    if (code := exit_code()) != INTERRUPTED:
-        raise typer.Exit(code)
 
 
 def hints(registry: "Registry", url: str) -> str:

@@ -34,7 +34,7 @@ from league.settings import Storage
 from tests.support.databases import on_both_databases
 from tests.support.leagues.ledger_matches import SCHEDULE, game, play_match
 from tests.support.leagues.registries import LEAGUE, registered
-from tests.support.small_disk import small_disk
+from tests.support.mounts import small_disk
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from league.registry.storage.database import Database
 from league.registry.storage.rows import HEARTBEAT_TIMEOUT, KeyRow, Record, RunRow
 from league.settings import Storage
 from tests.support.leagues.registries import LEAGUE, publish, registered
-from tests.support.small_disk import fill, read_only, small_disk
+from tests.support.mounts import fill, read_only, small_disk
 
 
 def slugs(registry: Registry) -> list[str]:
@@ -81,8 +81,16 @@ def test_a_database_that_cannot_be_written_is_read(registry: Registry) -> None:
 
 def test_a_link_to_a_disk_that_is_not_mounted_is_called_so(tmp_path: Path) -> None:
     (tmp_path / "home").symlink_to("/missing/disk")
-    with pytest.raises(StorageError, match=r"home cannot be used: it is a link to /missing/disk, which does not exist"):
-        Registry.open(Storage.at(tmp_path / "home"))
+    (tmp_path / "file").symlink_to("/missing/disk/league.db")
+    storage = Storage.at(tmp_path / "home")
+    file = replace(storage, database_url=f"sqlite:///{tmp_path}/file")
+    for broken, message in (
+        (storage, "home cannot be used: it is a link to /missing/disk, which does not exist"),
+        (Storage.at(tmp_path / "home" / "below"), "home cannot be used: it is a link to /missing/disk, which does not"),
+        (file, "file cannot be used: it is a link to /missing/disk/league.db, which does not exist"),
+    ):
+        with pytest.raises(StorageError, match=message):
+            Registry.open(broken)
 
 
 def settings_of(url: str) -> tuple[dict[str, str], str, str]:

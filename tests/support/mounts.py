@@ -1,4 +1,4 @@
-"""A small file system of its own, which a test can fill."""
+"""File systems for a test: a small one, which it can fill, and one that can only be read."""
 
 import os
 import subprocess
