@@ -351,10 +351,10 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
     def _end_wait(self, steps: Generator[Any, Any, StreamMessage | None], outcome: Any) -> None:
         self._is_busy = False
         self._advance(steps, outcome)
-        if self._pending and not self._is_held:
-            self._resume()
-        else:
+        if self._is_held:
             self._flush()
+        else:
+            self._resume()
 
     async def _finish(self, steps: Generator[Any, Any, StreamMessage | None], waits_for: Any) -> None:
         try:

@@ -16,6 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Opcode
 from websockets.sync.client import ClientConnection, connect
 
+from benchmarks.load.websocket import BINARY, frame_of
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.access import access_control
@@ -77,6 +78,19 @@ def test_messages_are_answered_in_order(listener: Listening) -> None:
         assert stream.response is not None
         assert "sec-websocket-extensions" not in stream.response.headers
         assert stream.response.headers["x-league-replica"] == "replica-1"
+
+
+def test_a_stream_is_read_again_after_its_messages_had_to_wait(listener: Listening) -> None:
+    message = encode_request([np.array([BOARD[name]], np.int8) for name in BOARD], 1)
+    number = uvicorn_websocket.MAX_FRAMES_PER_TURN + 1
+    with open_stream(listener) as stream:
+        stream.send(message)
+        expected = stream.recv(DEADLINE)
+        # The last of them is answered in another turn, and at its end.
+        stream.socket.sendall(frame_of(message, BINARY) * number)
+        assert [stream.recv(DEADLINE) for _ in range(number)] == [expected] * number
+        stream.send(message)
+        assert stream.recv(DEADLINE) == expected
 
 
 def test_messages_of_one_connection_share_one_state(listener: Listening) -> None:
