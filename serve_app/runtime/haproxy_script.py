@@ -15,6 +15,9 @@ A restarted controller waits at most ten seconds for its replicas to report, the
 them. The replicas run, so HAProxy keeps those that it knows until the controller names some. Its health checks
 find those that do not.
 
+Ray's HAProxy sends a line for each request to port 514 of this machine, where usually nobody listens. The script
+removes this unless LOG_TARGET is set.
+
 Ray's HAProxy calls the replicas of its node at 127.0.0.1. They listen on the server's host, as HAProxy does, so the
 script replaces the address.
 """
@@ -30,6 +33,8 @@ from typing import NoReturn
 COMMAND = "league-haproxy"
 BINARY_PATH = "RAY_SERVE_HAPROXY_BINARY_PATH"
 """Ray's variable for the binary. On the nodes of a cluster it names COMMAND."""
+LOG_TARGET = "RAY_SERVE_HAPROXY_LOG_TARGET"
+"""Ray's variable for the address of a syslog server."""
 STOPPED = "stopped"
 """File in HAProxy's directory: no stand-in starts any more."""
 STAND_IN = "standin"
@@ -98,6 +103,7 @@ amend() {{  # Ray's configuration
         -e 's|^frontend grpc_frontend$|&{grpc}|' \\
         -e "s/MOST/$((connections / 2))/g; s/SHARE/$((connections / 4))/g" \\
         "$1"
+    [ -n "${log_target}" ] || sed -i '/^ *log .* local0 info$/d' "$1"
 }}
 
 without_control() {{  # a configuration without the ports and sockets by which Ray knows its HAProxy
@@ -188,6 +194,7 @@ def script(directory: Path, binary: str, stats: int, metrics: int) -> str:
         reserved=RESERVED_DESCRIPTORS,
         stopped=STOPPED,
         stand_in=STAND_IN,
+        log_target=LOG_TARGET,
         all_of_ipv6=ALL_OF_IPV6,
     )
 
@@ -232,8 +239,7 @@ def error_response(status: int) -> str:
     """HAProxy's own response, in the formats of both protocols: the body of /v2 has `error`, others have `code`."""
     reason, code, message = ERRORS[status]
     body = json.dumps({"code": code, "message": message, "error": message})
-    headers = f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\nX-Content-Type-Options: nosniff\r\n"
-    headers += "Retry-After: 1\r\n"
+    headers = f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\nRetry-After: 1\r\n"
     return f"HTTP/1.1 {status} {reason}\r\n{headers}\r\n{body}"
 
 

@@ -115,6 +115,7 @@ class TestHAProxyConfiguration:
         ):
             assert lines.count(line) == 1, f"haproxy_script.py edits the section {line!r} of Ray's template"
         for start in (
+            "log 127.0.0.1:514 local0 info",
             "stats socket ",
             "server-state-base ",
             "server-state-file ",
@@ -173,6 +174,7 @@ class TestHAProxyConfiguration:
         for name in ("haproxy.cfg", "standin.cfg"):
             process = subprocess.run([*check, directory / name], capture_output=True, text=True, timeout=20)
             assert process.returncode == 0, f"HAProxy refuses {name} after haproxy_script.py: {process.stderr}"
+            assert "local0" not in (directory / name).read_text(), "haproxy_script.py does not find the line of the log"
 
     def test_the_starting_page_responds_until_a_replica_is_known(self, directory: Path) -> None:
         """Ray's proxy would keep requests waiting; it is a backup in case of faults, once there were replicas."""

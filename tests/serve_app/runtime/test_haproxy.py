@@ -270,28 +270,32 @@ def test_haproxy_listens_on_all_ports_after_it_has_taken_over(tmp_path: Path) ->
 COMMAND = str(Path(sys.executable).with_name(haproxy_script.COMMAND))
 ENVIRONMENT = os.environ | {haproxy_script.BINARY_PATH: COMMAND}
 """The environment of a node, in which Ray's HAProxy is the command itself."""
-LIMITED = """global
-    maxconn 16384
+LOG = "    log 127.0.0.1:514 local0 info\n"
+LIMITED = f"""global
+{LOG}    maxconn 16384
 defaults
     mode http
+    log global
+    option httplog
     timeout client 60s
     timeout connect 5s
     timeout server 5s
 frontend prometheus
-    bind :{metrics}
+    bind :{{metrics}}
 frontend http_frontend
     bind 127.0.0.1:1
 listen stats
-    bind *:{stats}
+    bind *:{{stats}}
 """
 
 
 def test_a_node_has_the_limits(tmp_path: Path) -> None:
     configuration = tmp_path / "haproxy.cfg"
     ports = {"RAY_SERVE_HAPROXY_STATS_PORT": "8500", "RAY_SERVE_HAPROXY_METRICS_PORT": "8501"}
+    logs = {haproxy_script.LOG_TARGET: "127.0.0.1:514"}
     # `-c` starts nothing.
     command = [COMMAND, "-db", "-f", str(configuration), "-c"]
-    for environment, stats, metrics in (({}, 8404, 9101), (ports, 8500, 8501)):
+    for environment, stats, metrics in (({}, 8404, 9101), (ports | logs, 8500, 8501)):
         configuration.write_text(LIMITED.format(stats=stats, metrics=metrics))
         checked = subprocess.run(command, env=ENVIRONMENT | environment, capture_output=True, text=True, timeout=60)
         assert checked.returncode == 0, checked.stderr
@@ -302,6 +306,7 @@ def test_a_node_has_the_limits(tmp_path: Path) -> None:
         assert "timeout check 5s" in amended, "a busy replica has more time than the interval of health checks"
         assert f"bind 127.0.0.1:{stats}" in amended, "statistics are for this machine only"
         assert f"bind 127.0.0.1:{metrics}" in amended
+        assert (LOG in amended) == (haproxy_script.LOG_TARGET in environment), "a line for each request"
     process = subprocess.run([COMMAND, "-v"], env=ENVIRONMENT, capture_output=True, text=True, timeout=60)
     assert (process.returncode, process.stdout[:15]) == (0, "HAProxy version"), "without a configuration"
 
@@ -443,6 +448,7 @@ def refused(directory: Path, path: str, replica: int) -> dict[str, str]:
     with proxy(directory, replica) as url, httpx.Client(base_url=url, trust_env=False) as client:
         response = client.post(path, json={})
     assert (response.headers["content-type"], response.headers["retry-after"]) == ("application/json", "1")
+    assert response.headers.get_list("x-content-type-options") == ["nosniff"]
     document: dict[str, str] = response.json()
     assert document["error"] == document["message"], "the field of /v2 is that of /v1"
     return {"status": str(response.status_code), "code": document["code"]}
@@ -512,7 +518,7 @@ def test_idle_connections_do_not_shut_out_others(tmp_path: Path) -> None:
         for client in with_key:
             reply = head_of_response(client, "/key")
             assert haproxy_script.KEY_ACCEPTED.encode() not in reply
-            assert b"x-content-type-options: nosniff" in reply
+            assert reply.count(b"\r\nx-content-type-options: nosniff\r\n") == 1, "that of the replica is replaced"
         closed = 0
         for _ in range(2 * CONNECTIONS):
             reply = head_of_response(connect(), "/")
