@@ -19,11 +19,11 @@ from ray import serve
 from ray.serve import Application
 from ray.serve.handle import DeploymentHandle
 from starlette.applications import Starlette
-from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
+from starlette.middleware.exceptions import ExceptionMiddleware
 from starlette.responses import RedirectResponse
 from starlette.routing import Match, Router
-from starlette.types import Receive, Scope, Send
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from league.errors import ConfigError
 from league.ray_cluster import check_deployed_stack
@@ -272,21 +272,20 @@ class Replica:
             DocsRoutes(self.alias_slots, self.access, partial(document, self.settings)),
             PageRoutes(),
         )
-        origins = self.settings.cors_origins
-        cors = Middleware(
-            CORSMiddleware, allow_origins=origins, allow_methods=("*",), allow_headers=("*",), expose_headers=("*",)
-        )
         application = Starlette(
-            routes=[route for owner in owners for route in routes_of(owner, self.models)],
-            middleware=[
-                *([cors] if origins else []),
-                Middleware(AccessControlMiddleware, self.access, self.errors, self.settings, self.access_log),
-                Middleware(ActionDispatch, self.action),
-            ],
-            exception_handlers=self.errors.handlers(),
-            lifespan=self._running,
+            routes=[route for owner in owners for route in routes_of(owner, self.models)], lifespan=self._running
         )
         _redirect_slashes(application.router)
+        # Starlette's own stack has its middleware for bugs outermost, where it costs every request, and responses to
+        # bugs lack the headers of the others.
+        stack: ASGIApp = ExceptionMiddleware(application.router, self.errors.handlers())
+        stack = ActionDispatch(stack, self.action)
+        stack = AccessControlMiddleware(stack, self.access, self.errors, self.settings, self.access_log)
+        if origins := self.settings.cors_origins:
+            stack = CORSMiddleware(
+                stack, allow_origins=origins, allow_methods=("*",), allow_headers=("*",), expose_headers=("*",)
+            )
+        application.middleware_stack = stack
         return application
 
     async def _start_evaluations(self) -> None:

@@ -42,8 +42,6 @@ KEY_SUBPROTOCOL = b"policy-league.key."
 HEADERS = ORIGIN_HEADERS | {b"authorization", b"sec-websocket-protocol", b"x-api-key", b"x-request-timeout-ms"}
 KEY_HEADER = (KEY_ACCEPTED.encode(), b"1")
 """Header of a response to a request with a key."""
-NO_SNIFFING = (b"x-content-type-options", b"nosniff")
-"""Header of every response: browsers must not guess another type than the declared one."""
 DENIAL = "websocket.http.response"
 """ASGI extension that sends an HTTP response when a WebSocket handshake is refused."""
 POLICY_VIOLATION = 1008
@@ -234,7 +232,7 @@ class AccessControlMiddleware:
             headers, need, key = scope.pop(ADMISSION, None) or self._access.admission(scope, path)
             if key is not None:
                 scope[KEY] = key
-                response.add_header(*KEY_HEADER)
+                response.has_key = True
                 if self._log is not None:
                     scope[LOG_ENTRY]["key"] = key.name
             if kind != "http" or need.is_stream:
@@ -247,17 +245,16 @@ class AccessControlMiddleware:
                 return
             with self._in_flight.opened(None):
                 await run_within(timeout, self._application(scope, receive, response.send))
-        except LeagueError as error:
-            if response.has_started:
-                raise
-            await self._refuse(error, scope, receive, response.send)
         except TimeLimitExceeded:
             if not response.has_started:  # otherwise the client is not reading, and uvicorn closes the connection
-                if scope["method"] == "POST" and BODY_READ not in scope:
-                    timed_out: LeagueError = BodyTooSlow(f"the request body did not arrive within {timeout:g} s")
-                else:
-                    timed_out = DeadlineExceeded(f"the request timed out after {timeout:g} s")
-                await self._refuse(timed_out, scope, receive, response.send)
+                await self._refuse(_timed_out(scope, timeout), scope, receive, response.send)
+        except Exception as error:
+            if isinstance(error, LeagueError) and not response.has_started:
+                await self._refuse(error, scope, receive, response.send)
+                return
+            if kind == "http":
+                await self._report(error, scope, receive, response)
+            raise
 
     async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket" and DENIAL not in scope.get("extensions", {}):
@@ -265,26 +262,29 @@ class AccessControlMiddleware:
             return
         await self._errors.response(_path(scope), error)(scope, receive, send)
 
+    async def _report(self, bug: Exception, scope: Scope, receive: Receive, response: "ResponseTracker") -> None:
+        answer = self._errors.internal_error(_path(scope), bug)
+        if not response.has_started:
+            await answer(scope, receive, response.send)
+
 
 class ResponseTracker:
-    """Adds headers to a response, and records whether it has started; after that no error response can be sent."""
+    """Records whether a response has started; after that no error response can be sent."""
 
-    __slots__ = ("_headers", "_send", "has_started")
+    __slots__ = ("_send", "has_key", "has_started")
 
     def __init__(self, send: Send) -> None:
         self._send = send
-        self._headers = [NO_SNIFFING]
+        self.has_key = False
+        """Whether the response gets KEY_HEADER."""
         self.has_started = False
-
-    def add_header(self, name: bytes, value: bytes) -> None:
-        """Add a header to the response, which has not started."""
-        self._headers.append((name, value))
 
     def send(self, message: Message) -> Awaitable[None]:
         """ASGI `send`."""
         if not self.has_started:
             self.has_started = True
-            message["headers"] = [*message.get("headers", ()), *self._headers]
+            if self.has_key:
+                message["headers"] = [*message.get("headers", ()), KEY_HEADER]
         return self._send(message)
 
 
@@ -354,6 +354,12 @@ def _seconds(milliseconds: bytes) -> float:
     if not (milliseconds.isdigit() and len(milliseconds) <= 9 and int(milliseconds)):
         raise InvalidInput("x-request-timeout-ms must be a positive number of milliseconds")
     return int(milliseconds) / 1000
+
+
+def _timed_out(scope: Scope, seconds: float) -> LeagueError:
+    if scope["method"] == "POST" and BODY_READ not in scope:
+        return BodyTooSlow(f"the request body did not arrive within {seconds:g} s")
+    return DeadlineExceeded(f"the request timed out after {seconds:g} s")
 
 
 def _path(scope: Scope) -> str:

@@ -89,7 +89,7 @@ def status_of(error: LeagueError) -> int:
 
 
 class ErrorHandlers:
-    """Starlette's exception handlers.
+    """Makes the responses to errors. Some methods are Starlette's exception handlers.
 
     retry: `Retry-After` of a 503, in seconds. count: called with the path and code of each error.
     """
@@ -105,7 +105,7 @@ class ErrorHandlers:
 
     def handlers(self) -> dict[Any, Any]:
         """Exception class → handler."""
-        return {LeagueError: self.league_error, HTTPException: self.http_error, Exception: self.internal_error}
+        return {LeagueError: self.league_error, HTTPException: self.http_error}
 
     async def league_error(self, request: Request, error: Exception) -> Response:
         """Handle a LeagueError."""
@@ -139,12 +139,11 @@ class ErrorHandlers:
         self._count(request.scope["path"], code)
         return error_response(request.scope["path"], error.status_code, code, message, headers)
 
-    async def internal_error(self, request: Request, error: Exception) -> Response:
-        """Handle a bug. The traceback goes to the log, not to the client."""
+    def internal_error(self, path: str, error: Exception) -> Response:
+        """The response to a request for `path` that met a bug. The traceback goes to the log, not to the client."""
         logger.error("a request failed", exc_info=error)
-        self._count(request.scope["path"], "internal_error")
-        message, headers = "internal server error; see the server log", {"x-content-type-options": "nosniff"}
-        return error_response(request.scope["path"], 500, "internal_error", message, headers)
+        self._count(path, "internal_error")
+        return error_response(path, 500, "internal_error", "internal server error; see the server log")
 
 
 def error_response(path: str, status: int, code: str, message: str, headers: Any = None) -> Response:

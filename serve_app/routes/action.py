@@ -140,7 +140,7 @@ class ActionRoute:
 
 
 class ActionDispatch:
-    """ASGI middleware that sends action requests to their route without searching the routing table."""
+    """Sends action requests to their route without searching the routing table, and others to the application."""
 
     def __init__(self, application: ASGIApp, action: ActionRoute) -> None:
         self._application = application

@@ -25,7 +25,7 @@ from starlette.types import Scope
 from league.errors import GraphTimeout, LeagueError
 from league.policies.policy import Actions
 from league.refs import CHAMPION
-from serve_app.access.access_control import ADMISSION, KEY_HEADER, NO_SNIFFING, Admission
+from serve_app.access.access_control import ADMISSION, KEY_HEADER, Admission
 from serve_app.access.errors import ErrorHandlers
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference.action_request import REPLICA, Arrays, generators
@@ -139,7 +139,7 @@ class PlainActions:
         # The application adds the headers for pages of other origins.
         self._not_plain = NOT_PLAIN | ({b"origin"} if dependencies.settings.cors_origins else set())
         self._errors = errors
-        headers = [(REPLICA, replica.encode()), NO_SNIFFING]
+        headers = [(REPLICA, replica.encode())]
         self._headers, self._headers_with_key = _lines(headers), _lines([*headers, KEY_HEADER])
         self._arrived: list[HttpProtocol] = []
         """Connections whose request was not admitted yet."""
@@ -198,8 +198,7 @@ class PlainActions:
                 self._queue.append((time, connection))
             except LeagueError as error:
                 response = self._errors.response(path, error)
-                headers = _lines([*response.raw_headers, NO_SNIFFING])
-                connection.answer(response.status_code, headers, bytes(response.body))
+                connection.answer(response.status_code, _lines(response.raw_headers), bytes(response.body))
             except Exception as error:
                 logger.error("a plain request was not admitted", exc_info=error)
                 connection.pass_on()

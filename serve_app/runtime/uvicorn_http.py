@@ -29,6 +29,7 @@ from typing import Any, Protocol, cast
 from weakref import WeakKeyDictionary
 
 from uvicorn.config import Config
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from uvicorn.protocols.http import auto
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
@@ -125,6 +126,9 @@ def _header_lines(headers: list[tuple[bytes, bytes]]) -> bytes:
     return _lines[1]
 
 
+NO_SNIFFING = (b"x-content-type-options", b"nosniff")
+"""Header of every response: browsers must not guess another type than the declared one. uvicorn does not add it where a
+WebSocket handshake is refused, which browsers show to no page."""
 NO_HTTP = b'{"code": "invalid_input", "message": "the request is not valid HTTP"}'
 MALFORMED = (
     b"HTTP/1.1 400 Bad Request\r\ncontent-type: application/json\r\nx-content-type-options: nosniff\r\n"
@@ -167,6 +171,12 @@ class HttpProtocol(HttpToolsProtocol):
         _loop: asyncio.AbstractEventLoop | None = None,
     ) -> None:
         super().__init__(config, server_state, app_state, _loop)
+        if isinstance(self.app, ProxyHeadersMiddleware):  # nothing reads the address and scheme that it sets
+            self.app = self.app.app
+        # The server copies those of its configuration every second.
+        for headers in (config.encoded_headers, server_state.default_headers):
+            if NO_SNIFFING not in headers:
+                headers.append(NO_SNIFFING)
         self._when_stopping = when_stopping
         # The general path sends 503 beyond `limit_concurrency`, and writes uvicorn's access log.
         is_logged = self.access_log and self.access_logger.isEnabledFor(logging.INFO)

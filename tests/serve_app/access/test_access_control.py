@@ -112,22 +112,6 @@ def test_haproxy_is_told_that_a_key_was_accepted(registry: Registry) -> None:
         assert KEY_ACCEPTED not in client.post(ACTION, json=BODY, headers=bearer("x" * 47)).headers
 
 
-def test_browsers_do_not_guess_the_type_of_a_response(read_only_client: TestClient) -> None:
-    for path in ("/", "/docs", "/openapi.json", "/v1/leagues", "/v1/nothing", "/v2", "/metrics", "/?"):
-        for method in ("GET", "POST", "HEAD"):
-            response = read_only_client.request(method, path)
-            assert response.headers.get_list("x-content-type-options") == ["nosniff"], (method, path)
-
-
-def test_an_error_of_ours_has_the_headers_of_a_response(storage: Storage, monkeypatch: pytest.MonkeyPatch) -> None:
-    server = Replica(Registry.open(storage), QUICK, "replica-1")
-    monkeypatch.setattr(server.models, "in_registry_thread", None)
-    application = server.application()
-    with TestClient(application, base_url=LOCALHOST, raise_server_exceptions=False) as client:
-        response = client.get("/v1/leagues")
-    assert (response.status_code, response.headers["x-content-type-options"]) == (500, "nosniff")
-
-
 def test_whether_keys_are_required(registry: Registry) -> None:
     """Not for health routes."""
 
@@ -372,6 +356,29 @@ def test_each_request_is_a_line(registry: Registry, log: Path) -> None:
     assert token not in log.read_text()
 
 
+def test_a_bug_is_answered_logged_counted_and_raised(
+    registry: Registry, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In requests that the routing table distributes, and in those that go to their route without it."""
+    _, token = registry.keys.create("player", ["act", "read"])
+    headers = bearer(token) | {"origin": GAME}
+    settings = LOGGING_SETTINGS.model_copy(update={"cors_origins": [GAME]})
+    server = Replica(Registry.open(registry.storage), settings, "replica-1")
+    application = server.application()
+    with TestClient(application, base_url=LOCALHOST, raise_server_exceptions=False) as client:
+        for name in ("in_registry_thread", "find"):
+            monkeypatch.setattr(server.models, name, None)
+        replies = [client.get("/v1/leagues", headers=headers), client.post(ACTION, json=BODY, headers=headers)]
+        for reply in replies:
+            assert_rejected(reply, 500, "internal_error", "see the server log")
+            assert reply.headers["access-control-allow-origin"] == GAME, "a page can read it"
+        with pytest.raises(TypeError):
+            TestClient(application, base_url=LOCALHOST).post(ACTION, json=BODY, headers=headers)
+        counts = server.metrics.report()["league_errors_total"]
+        assert sum(count for labels, count in counts if "internal_error" in labels) == 3
+    assert [line["status"] for line in lines(log)] == [500, 500, 500]
+
+
 def test_requests_succeed_if_the_log_cannot_be_written(registry: Registry, log: Path) -> None:
     log.parent.write_text("a file where the directory should be")
     with replica(registry.storage, LOGGING_SETTINGS) as client:
@@ -425,8 +432,8 @@ def test_paths_hosts_and_unexpected_exceptions_are_only_logged() -> None:
     error = StorageError("the database postgresql://admin@db.internal/league cannot be used: no route to host")
     message = "the registry's database or files cannot be used; see the server log"
     assert answer(error)[1] == {"code": "storage_error", "message": message}
-    status, body, _ = answer(ZeroDivisionError("secret"))
-    assert (status, body["code"], "secret" in body["message"]) == (500, "internal_error", False)
+    reply = ErrorHandlers(retry=3, count=lambda *_: None).internal_error("/", ZeroDivisionError("secret"))
+    assert (reply.status_code, b"internal_error" in reply.body, b"secret" in reply.body) == (500, True, False)
 
 
 PERMISSIONS = Permissions(ROUTES)

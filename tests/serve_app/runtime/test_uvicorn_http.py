@@ -12,9 +12,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from weakref import WeakKeyDictionary
 
+import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.http.httptools_impl import RequestResponseCycle
 from uvicorn.server import ServerState
@@ -187,7 +189,23 @@ def test_what_is_not_http_gets_an_error_of_the_api() -> None:
         client.sendall(b"\x16\x03\x01\x02\r\n\r\n")
         reply = answered(client)
     assert reply.startswith(b"HTTP/1.1 400 ")
-    assert b"x-content-type-options: nosniff" in reply
+    assert reply.count(b"\r\nx-content-type-options: nosniff\r\n") == 1
+
+
+def test_browsers_do_not_guess_the_type_of_a_response() -> None:
+    """Also after the server has made its default headers anew, which it does every second."""
+
+    async def no_route(scope: Scope, receive: Receive, send: Send) -> None:
+        await Response(status_code=404)(scope, receive, send)
+
+    for application in (no_content, no_route):
+        with serving(application, "uvloop") as address, httpx.Client(trust_env=False) as client:
+            url = f"http://{address[0]}:{address[1]}/"
+            dates = set()
+            while len(dates) < 2:
+                reply = client.get(url)
+                assert reply.headers.get_list("x-content-type-options") == ["nosniff"]
+                dates.add(reply.headers["date"])
 
 
 def test_waiting_connections_are_counted() -> None:
