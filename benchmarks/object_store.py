@@ -26,7 +26,8 @@ from benchmarks.leagues.served_league import LEAGUE, builder, fill
 from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest
 from league.settings import Storage
-from serve_app.live_versions.version_cache import ActionSelections, load
+from serve_app.live_versions.policies import ActionSelections
+from serve_app.live_versions.version_cache import load
 from tests.support.servers import object_store
 
 KILLS, LATEST_KILL = 100, 0.04

@@ -45,6 +45,7 @@ from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.rest import InferRoute, RestRoutes
 from serve_app.inference_protocol.statistics import REPORT
 from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.policies import ActionSelections
 from serve_app.live_versions.polling import Polling
 from serve_app.live_versions.registry_connection import RegistryConnection
 from serve_app.live_versions.registry_watcher import RegistryWatcher, WatchedState
@@ -52,7 +53,7 @@ from serve_app.live_versions.remote_search import SearchClient
 from serve_app.live_versions.resolver import ModelResolver
 from serve_app.live_versions.shadow import Shadow
 from serve_app.live_versions.traffic_split import TrafficSplit
-from serve_app.live_versions.version_cache import ActionSelections, VersionCache, load
+from serve_app.live_versions.version_cache import VersionCache, load
 from serve_app.observability.load import LoadSampler
 from serve_app.observability.metrics import Metrics, Report
 from serve_app.observability.metrics_reporter import MetricsReporter

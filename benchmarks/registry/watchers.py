@@ -14,10 +14,11 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.access.api_keys import ApiKeyCache
 from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.policies import ActionSelections, LoadedVersion
 from serve_app.live_versions.registry_connection import RegistryConnection
 from serve_app.live_versions.registry_watcher import RegistryWatcher, WatchedState
 from serve_app.live_versions.traffic_split import TrafficSplit
-from serve_app.live_versions.version_cache import ActionSelections, LoadedVersion, VersionCache
+from serve_app.live_versions.version_cache import VersionCache
 from serve_app.runtime.replica_process import this_process
 from serve_app.settings import ServeSettings
 

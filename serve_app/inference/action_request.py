@@ -20,9 +20,9 @@ from league.spaces.observation_codec import json_type, read_state, reject_string
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
 from serve_app.codecs.state_tokens import read_state as state_of_tokens
+from serve_app.live_versions.policies import Graph, LoadedPolicy
 from serve_app.live_versions.remote_search import RemoteSearch
 from serve_app.live_versions.resolver import version_of
-from serve_app.live_versions.version_cache import Graph, LoadedPolicy, LoadedVersion
 
 KEYS = frozenset(
     ("observation", "observations", "state", "explore", "seed", "probabilities", "deadline_ms", "analysis")
@@ -163,16 +163,14 @@ def is_plain(request: DecodedActionRequest, policy: LoadedPolicy, quotes: int) -
     return quotes == 2 * (request.strings + len(request.observations) * policy.reader.keys)
 
 
-def decode_state(
-    request: DecodedActionRequest, version: LoadedVersion, policy: LoadedPolicy, has_strings: bool = True
-) -> Arrays | None:
+def decode_state(request: DecodedActionRequest, policy: LoadedPolicy, has_strings: bool = True) -> Arrays | None:
     """Decode the recurrent state of the request. Raises ObservationError or InvalidState."""
     if not request.state and not any(request.tokens or ()):
         return None
     if not policy.state:
         raise InvalidState("state must be null: this policy is not recurrent")
     if request.tokens is not None:
-        return state_of_tokens(request.tokens, version.model(policy), version.sha256, policy.state)
+        return state_of_tokens(request.tokens, policy.qualified, policy.sha256, policy.state)
     if has_strings:
         reject_strings(request.state)
     return read_state(request.state, policy.state, len(request.observations))
@@ -189,10 +187,9 @@ async def read_observations(request: DecodedActionRequest, policy: LoadedPolicy,
     return await asyncio.to_thread(policy.reader.read, request.observations, plain)
 
 
-def encode_state(answer: Actions, version: LoadedVersion, policy: LoadedPolicy) -> list[str]:
-    """Encode the new state as tokens."""
-    assert answer.state is not None
-    return write_tokens(version.model(policy), version.number, version.sha256, answer.state)
+def encode_state(state: Arrays, policy: LoadedPolicy) -> list[str]:
+    """Encode a state as tokens."""
+    return write_tokens(policy.qualified, policy.number, policy.sha256, state)
 
 
 def is_sampled(explore: bool | None, policy: LoadedPolicy) -> bool:
@@ -249,7 +246,7 @@ def build_response(
     if request.probabilities:
         assert answer.dist_inputs is not None
         # An action that is certain has the probability 1 even if it is illegal.
-        mask = observations.get(ACTION_MASK) if policy.policy.has_distribution else None
+        mask = observations.get(ACTION_MASK) if policy.graph.has_distribution else None
         likely = probabilities(answer.dist_inputs, policy.manifest.action, mask)
         response["probabilities"] = likely if request.is_batch else likely[0]
     return response

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple, Protocol
 
 from league.policies.policy import Actions
 from serve_app.inference.action_request import Arrays
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.traffic_split import Headers
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.runtime.uvicorn_http import HttpProtocol
 
 
@@ -26,7 +26,7 @@ class PlainRequest(NamedTuple):
     connection: HttpProtocol
     time: int
     target: Target
-    version: LoadedVersion
+    policy: LoadedPolicy
     content: Any
     rows: int
     has_key: bool
@@ -49,9 +49,7 @@ class PlainFormat(Protocol):
     def in_flight(self) -> int:
         """Requests of its route in flight, of which a replica has `max_in_flight` at most."""
 
-    def parse(
-        self, target: Target, headers: Headers, body: bytes, version: LoadedVersion, policy: LoadedPolicy
-    ) -> tuple[Any, int] | None:
+    def parse(self, target: Target, headers: Headers, body: bytes, policy: LoadedPolicy) -> tuple[Any, int] | None:
         """The content and its number of rows. If it is None, the application answers, and if
         it raises JSONDecodeError, KeyError or LeagueError."""
 

@@ -14,7 +14,7 @@ import numpy as np
 from league.errors import GraphTimeout, LeagueError
 from league.policies.policy import Actions
 from serve_app.inference.action_request import Arrays, execute, generators
-from serve_app.live_versions.version_cache import LoadedPolicy
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.runtime.ray_serve import logger
 
 Outcome = Actions | Exception

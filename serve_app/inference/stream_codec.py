@@ -9,8 +9,6 @@ With 16 bytes the first tensor is aligned in memory and can be used without a co
 
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass
-from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -18,10 +16,10 @@ from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, InvalidInput, ObservationError
 from league.policies.onnx import ACTION
-from league.spaces import ACTION_MASK, Leaf
+from league.spaces import ACTION_MASK
 from league.spaces.arrays import check, check_mask
 from league.spaces.binary_leaves import little_endian
-from serve_app.live_versions.version_cache import LoadedPolicy
+from serve_app.live_versions.policies import LoadedPolicy
 
 FRAMING = 1
 REQUEST = struct.Struct("<BBHIQ")
@@ -43,58 +41,36 @@ class BinaryRequest(NamedTuple):
     tensors: memoryview
 
 
-@dataclass(frozen=True, slots=True)
-class _Input:
-    """One tensor of a request."""
-
-    name: str
-    leaf: Leaf
-    dtype: np.dtype
-    size: int
-    """Bytes per row."""
-
-
-class BinaryCodec:
-    """Decodes requests and encodes responses of one policy."""
-
-    def __init__(self, policy: LoadedPolicy) -> None:
-        self._inputs = [
-            _Input(name, leaf, _little(leaf.dtype), np.dtype(leaf.dtype).itemsize * prod(leaf.shape))
-            for name, _, leaf in policy.reader.leaves
-        ]
-        self._row = sum(tensor.size for tensor in self._inputs)
-        self._is_masked = policy.reader.is_masked
-        self._action = _little(next(tensor.dtype for tensor in policy.manifest.outputs if tensor.name == ACTION))
-
-    def read(self, request: BinaryRequest) -> dict[str, NDArray]:
-        """Decode the graph's inputs, without state. Raises ObservationError or IllegalMask."""
-        if len(request.tensors) != (size := request.rows * self._row):
-            parts = " + ".join(f"{tensor.size} {tensor.name}" for tensor in self._inputs)
-            raise ObservationError(
-                f"the tensors have {len(request.tensors)} bytes, expected {size}: {request.rows} rows of {parts}"
-            )
-        slices, at = list[memoryview](), 0
-        for tensor in self._inputs:
-            end = at + request.rows * tensor.size
-            slices.append(request.tensors[at:end])
-            at = end
-        return self.arrays(slices, request.rows)
-
-    def arrays(self, tensors: Iterable[bytes | memoryview], rows: int) -> dict[str, NDArray]:
-        """The graph's inputs from the bytes of each. Raises ObservationError or IllegalMask."""
-        arrays = {}
-        for tensor, data in zip(self._inputs, tensors, strict=True):
-            array = little_endian(tensor.name, data, tensor.dtype).reshape(rows, *tensor.leaf.shape)
-            arrays[tensor.name] = check(tensor.name, array, tensor.leaf)
-        if self._is_masked:
-            check_mask(arrays[ACTION_MASK])
-        return arrays
-
-    def write(self, actions: NDArray, version: int) -> bytes:
-        """Encode the response."""
-        return (
-            RESPONSE.pack(FRAMING, 0, 0, len(actions), version, 0) + actions.astype(self._action, copy=False).tobytes()
+def read_tensors(policy: LoadedPolicy, request: BinaryRequest) -> dict[str, NDArray]:
+    """Decode the graph's inputs, without state. Raises ObservationError or IllegalMask."""
+    if len(request.tensors) != (size := request.rows * sum(port.row_bytes for port in policy.observed)):
+        parts = " + ".join(f"{port.row_bytes} {port.name}" for port in policy.observed)
+        raise ObservationError(
+            f"the tensors have {len(request.tensors)} bytes, expected {size}: {request.rows} rows of {parts}"
         )
+    tensors, at = list[memoryview](), 0
+    for port in policy.observed:
+        end = at + request.rows * port.row_bytes
+        tensors.append(request.tensors[at:end])
+        at = end
+    return observations_of(policy, tensors, request.rows)
+
+
+def observations_of(policy: LoadedPolicy, tensors: Iterable[bytes | memoryview], rows: int) -> dict[str, NDArray]:
+    """The graph's inputs, without state, from the bytes of each. Raises ObservationError or IllegalMask."""
+    arrays = {}
+    for port, data in zip(policy.observed, tensors, strict=True):
+        array = little_endian(port.name, data, port.dtype).reshape(rows, *port.leaf.shape)
+        arrays[port.name] = check(port.name, array, port.leaf)
+    if policy.is_masked:
+        check_mask(arrays[ACTION_MASK])
+    return arrays
+
+
+def write_actions(policy: LoadedPolicy, actions: NDArray) -> bytes:
+    """Encode the response."""
+    head = RESPONSE.pack(FRAMING, 0, 0, len(actions), policy.number, 0)
+    return head + actions.astype(policy.outputs[ACTION].dtype, copy=False).tobytes()
 
 
 def parse_request(message: bytes, max_batch: int) -> BinaryRequest:
@@ -125,10 +101,6 @@ def _resets(data: bytes, rows: int) -> NDArray:
     if len(data) != rows or data.strip(b"\0\1"):
         raise InvalidInput(f"resets must be {rows} bytes of 0 or 1")
     return np.frombuffer(data, np.bool_)
-
-
-def _little(dtype: str) -> np.dtype:
-    return np.dtype(dtype).newbyteorder("<")
 
 
 def encode_request(

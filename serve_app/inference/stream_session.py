@@ -8,7 +8,7 @@ import asyncio
 from dataclasses import dataclass
 from math import ceil
 from time import perf_counter_ns
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import orjson
@@ -23,12 +23,13 @@ from serve_app.access.api_keys import ApiKey
 from serve_app.access.errors import MalformedBody, status_of
 from serve_app.access.request_body import parse_json_object
 from serve_app.codecs.request_limits import LARGE_BODY
-from serve_app.codecs.state_tokens import read_state, write_tokens
 from serve_app.inference.action_request import (
     KEYS,
     Arrays,
     DecodedActionRequest,
     build_response,
+    decode_state,
+    encode_state,
     execute,
     execute_request,
     generators,
@@ -41,12 +42,12 @@ from serve_app.inference.action_request import (
     reject_unknown_keys,
 )
 from serve_app.inference.stream_batches import StreamBatches
-from serve_app.inference.stream_codec import BinaryCodec, parse_request
+from serve_app.inference.stream_codec import parse_request, read_tensors, write_actions
 from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.resolver import ModelResolver, policy_ref
 from serve_app.live_versions.shadow import Shadow
 from serve_app.live_versions.traffic_split import Headers, TrafficSplit, acting
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.observability.metrics import Metrics
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import CloseStream, StreamMessage
@@ -58,21 +59,6 @@ INVALID_PAYLOAD = 1007
 API = "stream"
 """Name of stream messages in metrics."""
 INTERNAL_ERROR = {"code": "internal_error", "message": "internal server error; see the server log", "status": 500}
-
-
-class ServedPolicy(NamedTuple):
-    """The version and policy that answer, with the codec for binary messages."""
-
-    version: LoadedVersion
-    policy: LoadedPolicy
-    codec: BinaryCodec
-    signature: dict[str, Any]
-    """Identifies the version in each JSON response."""
-
-    @classmethod
-    def of(cls, model: str, version: LoadedVersion, policy: LoadedPolicy) -> "ServedPolicy":
-        signature = {"model": model, "version": version.number, "sha256": version.sha256}
-        return cls(version, policy, BinaryCodec(policy), signature)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +77,7 @@ class InferenceDependencies:
 class StreamSession:
     """The session of one connection; messages are passed in one at a time.
 
-    follows: the alias to follow; None pins the version of `served`. headers: those of the handshake; the caller's key
+    follows: the alias to follow; None pins the version of `policy`. headers: those of the handshake; the caller's key
     may route a stream that follows the champion to the canary, and selects the member of a mixture. batches: of all
     streams, if the connection can wait for them.
     """
@@ -100,7 +86,7 @@ class StreamSession:
         self,
         dependencies: InferenceDependencies,
         model: str,
-        served: tuple[LoadedVersion, LoadedPolicy],
+        policy: LoadedPolicy,
         follows: str | None,
         headers: Headers,
         key: ApiKey | None,
@@ -114,7 +100,7 @@ class StreamSession:
         self._headers = headers
         self._key = key
         self._batches = batches
-        self._served = ServedPolicy.of(model, *served)
+        self._policy = policy
         self._state: Arrays | None = None
         """Recurrent state, one row per observation of the last message; None at the start of episodes."""
         self._is_batch = False
@@ -145,18 +131,18 @@ class StreamSession:
         """What a client needs to continue on another replica: the recurrent state, if any."""
         if self._state is None:
             return None
-        return _text({"closing": True, "state": self._tokens()} | self._served.signature)
+        return self._signed({"closing": True, "state": self._tokens()})
 
     async def _answer_text(self, data: bytes) -> StreamMessage:
         start = perf_counter_ns()
         if is_large := len(data) > LARGE_BODY:
-            self._served.policy.limits.check_body(data, self._dependencies.settings.max_batch)
+            self._policy.limits.check_body(data, self._dependencies.settings.max_batch)
         document = await asyncio.to_thread(_parsed, data) if is_large else _parsed(data)
         reject_unknown_keys(document, KEYS | STREAM_ONLY_KEYS)
         stream_keys = document.keys() & STREAM_ONLY_KEYS
         if document.keys() == {"reset"} and parse_flag(document, "reset"):
-            self._served, self._state = self._current(is_anew=True), None
-            return _text({"reset": True} | self._served.signature)
+            self._policy, self._state = self._current(is_anew=True), None
+            return self._signed({"reset": True})
         return_state, reset = parse_flag(document, "return_state"), document.get("reset", False)
         for key in stream_keys:
             del document[key]
@@ -164,56 +150,53 @@ class StreamSession:
         if request.state is not None:
             raise InvalidState("state is an object, expected a token: streams do not accept arrays")
         is_anew = reset is True or ("state" in document and document["state"] is None)
-        served, state = await self._select(request, is_anew, _resets(reset, request))
-        plain = is_plain(request, served.policy, data.count(b'"') - 2 * len(stream_keys))
-        observations = await read_observations(request, served.policy, plain, len(data))
-        answer, is_greedy = await execute_request(request, served.policy, observations, state)
-        self._mirror(served, observations, state, answer.actions if is_greedy else None)
-        self._store_state(served, answer, request.is_batch)
-        response = build_response(request, answer, observations, served.policy) | served.signature
+        policy, state = await self._select(request, is_anew, _resets(reset, request))
+        plain = is_plain(request, policy, data.count(b'"') - 2 * len(stream_keys))
+        observations = await read_observations(request, policy, plain, len(data))
+        answer, is_greedy = await execute_request(request, policy, observations, state)
+        self._mirror(policy, observations, state, answer.actions if is_greedy else None)
+        self._store_state(policy, answer, request.is_batch)
+        response = build_response(request, answer, observations, policy)
         if return_state and self._state is not None:
             response["state"] = self._tokens()
-        message = _text(response)
-        self._count(served, len(request.observations), start)
+        message = self._signed(response)
+        self._count(policy, len(request.observations), start)
         return message
 
     async def _answer_binary(self, data: bytes) -> StreamMessage:
         start = perf_counter_ns()
         request = parse_request(data, self._dependencies.settings.max_batch)
-        served, state = self._continue(request.rows, request.reset, request.resets)
-        observations = served.codec.read(request)
-        explore = is_sampled(request.explore, served.policy)
-        if self._batches is not None and state is None and request.seed is None and not served.policy.state:
-            answer = await self._batches.act(served.policy, observations, request.rows, explore)
+        policy, state = self._continue(request.rows, request.reset, request.resets)
+        observations = read_tensors(policy, request)
+        explore = is_sampled(request.explore, policy)
+        if self._batches is not None and state is None and request.seed is None and not policy.state:
+            answer = await self._batches.act(policy, observations, request.rows, explore)
         else:
             rng = generators(request.seed, request.rows) if explore else None
-            answer = await execute(served.policy, observations, state, rng)
-        self._mirror(served, observations, state, None if explore else answer.actions)
-        self._store_state(served, answer, is_batch=request.rows > 1)
-        message = StreamMessage(served.codec.write(answer.actions, served.version.number), False)
-        self._count(served, request.rows, start)
+            answer = await execute(policy, observations, state, rng)
+        self._mirror(policy, observations, state, None if explore else answer.actions)
+        self._store_state(policy, answer, is_batch=request.rows > 1)
+        message = StreamMessage(write_actions(policy, answer.actions), False)
+        self._count(policy, request.rows, start)
         return message
 
     async def _select(
         self, request: DecodedActionRequest, is_anew: bool, resets: NDArray | None
-    ) -> tuple[ServedPolicy, Arrays | None]:
-        """The version that answers, and the recurrent state. Raises InvalidState and the errors of
+    ) -> tuple[LoadedPolicy, Arrays | None]:
+        """The policy that answers, and the recurrent state. Raises InvalidState and the errors of
         `ModelResolver.find`.
         """
         if request.tokens is None or not any(request.tokens):
             return self._continue(len(request.observations), is_anew or request.tokens is not None, resets)
         if is_anew or resets is not None:
             raise InvalidState("reset and state are mutually exclusive: an episode starts or continues")
-        number = pinned_version(request, self._model, self._follows or str(self._served.version.number))
-        served = self._served
-        if int(number) != served.version.number:
-            served = ServedPolicy.of(self._model, *await self._dependencies.models.find(self._model, number))
-        if not served.policy.state:
-            raise InvalidState("state must be null: this policy is not recurrent")
-        model = served.version.model(served.policy)
-        return served, read_state(request.tokens, model, served.version.sha256, served.policy.state)
+        number = pinned_version(request, self._model, self._follows or str(self._policy.number))
+        policy = self._policy
+        if int(number) != policy.number:
+            policy = await self._dependencies.models.find(self._model, number)
+        return policy, decode_state(request, policy)
 
-    def _continue(self, rows: int, is_anew: bool, resets: NDArray | None) -> tuple[ServedPolicy, Arrays | None]:
+    def _continue(self, rows: int, is_anew: bool, resets: NDArray | None) -> tuple[LoadedPolicy, Arrays | None]:
         is_anew = is_anew or (resets is not None and bool(resets.all()))
         if self._state is None or is_anew:
             return self._current(is_anew), None
@@ -221,45 +204,49 @@ class StreamSession:
         if held != rows:
             raise InvalidState(f"the last message had {held} observations, this one has {rows}: a reset is required")
         if resets is None or not resets.any():
-            return self._served, self._state
+            return self._policy, self._state
         state = {name: array.copy() for name, array in self._state.items()}
         for array in state.values():
             array[resets] = 0
-        return self._served, state
+        return self._policy, state
 
-    def _current(self, is_anew: bool) -> ServedPolicy:
-        """The version that answers now, if no recurrent state depends on it. is_anew: whether episodes start."""
-        if self._follows is None:
-            return self._served
-        version = self._dependencies.slots.follow(self._ref.league, self._follows) or self._served.version
+    def _current(self, is_anew: bool) -> LoadedPolicy:
+        """The policy that answers now, if no recurrent state depends on it. is_anew: whether episodes start."""
+        version = None
+        if self._follows is not None:
+            version = self._dependencies.slots.follow(self._ref.league, self._follows)
+        if version is None:
+            return self._policy
         if self._follows == CHAMPION and self._dependencies.traffic.canaries:
             version = self._dependencies.traffic.route(version, self._headers)
         # An episode stays with the member of a mixture that it began with.
         if version.mixture is not None:
-            is_member = self._served.version in version.members
-            version = self._served.version if is_member and not is_anew else acting(version, self._headers)
-        if version is self._served.version:
-            return self._served
-        return ServedPolicy.of(self._model, version, version.policy(self._ref.policy))
+            is_member = any(member.policies.get(self._policy.name) is self._policy for member in version.members)
+            if is_member and not is_anew:
+                return self._policy
+            version = acting(version, self._headers)
+        return version.policy(self._ref.policy)
 
     def _mirror(
-        self, served: ServedPolicy, observations: Arrays, state: Arrays | None, actions: NDArray | None
+        self, policy: LoadedPolicy, observations: Arrays, state: Arrays | None, actions: NDArray | None
     ) -> None:
-        mirror = self._dependencies.shadow.mirror_for(self._model, served.version)
+        mirror = self._dependencies.shadow.mirror_for(policy)
         if mirror is not None:
             mirror(observations, state, actions)
 
-    def _count(self, served: ServedPolicy, rows: int, begun: int) -> None:
-        self._dependencies.metrics.count_request(API, self._model, served.version, rows, perf_counter_ns() - begun)
+    def _count(self, policy: LoadedPolicy, rows: int, begun: int) -> None:
+        self._dependencies.metrics.count_request(API, policy, rows, perf_counter_ns() - begun)
 
-    def _store_state(self, served: ServedPolicy, answer: Actions, is_batch: bool) -> None:
-        self._served, self._state, self._is_batch = served, answer.state, is_batch
+    def _store_state(self, policy: LoadedPolicy, answer: Actions, is_batch: bool) -> None:
+        self._policy, self._state, self._is_batch = policy, answer.state, is_batch
 
     def _tokens(self) -> str | list[str]:
         assert self._state is not None
-        version, policy, *_ = self._served
-        tokens = write_tokens(version.model(policy), version.number, version.sha256, self._state)
+        tokens = encode_state(self._state, self._policy)
         return tokens if self._is_batch else tokens[0]
+
+    def _signed(self, document: dict[str, Any]) -> StreamMessage:
+        return StreamMessage(orjson.dumps(document)[:-1] + self._policy.signature(self._model), True)
 
 
 def error_message(error: LeagueError, retry: float) -> StreamMessage:

@@ -11,7 +11,7 @@ from league.errors import StorageError
 from league.registry.registry import Registry
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.statistics import REPORT, Document, ModelStatistics, sum_documents
-from serve_app.inference_protocol.tensors import TensorSpec
+from serve_app.live_versions.policies import Port
 from serve_app.live_versions.resolver import ModelResolver
 from serve_app.live_versions.version_cache import VersionCache
 from serve_app.settings import ServeSettings
@@ -49,31 +49,30 @@ class ModelCatalogue:
 
         Raises the errors of `ModelResolver.find`.
         """
-        served = await self._inference.find(model, version)
-        league = served.version.league
+        policy = await self._inference.find(model, version)
+        league = policy.league
         try:
             numbers = await self._models.in_registry_thread(lambda registry: registry.versions.numbers(league)[league])
         except StorageError:
-            numbers = [served.version.number]
+            numbers = [policy.number]
         return {
             "name": model,
             "versions": [str(number) for number in numbers],
             "platform": PLATFORM,
-            "inputs": _tensors(served.signature.inputs.values()),
-            "outputs": _tensors(served.signature.outputs.values()),
+            "inputs": _tensors(policy.inputs.values()),
+            "outputs": _tensors(policy.outputs.values()),
         }
 
     async def config(self, model: str, version: str) -> Document:
         """Triton's model configuration. Raises the errors of `ModelResolver.find`."""
-        served = await self._inference.find(model, version)
-        signature = served.signature
+        policy = await self._inference.find(model, version)
         return {
             "name": model,
             "platform": PLATFORM,
             "backend": BACKEND,
             "max_batch_size": self._settings.max_batch,
-            "input": [_configured(port) | {"optional": port.is_state} for port in signature.inputs.values()],
-            "output": [_configured(port) for port in signature.outputs.values()],
+            "input": [_configured(port) | {"optional": port.is_state} for port in policy.inputs.values()],
+            "output": [_configured(port) for port in policy.outputs.values()],
         }
 
     async def statistics(self, model: str = "", version: str = "") -> Document:
@@ -93,13 +92,12 @@ class ModelCatalogue:
         documents = sum_documents(documents)
         if not model:
             return {"model_stats": documents}
-        served = await self._inference.find(model, version)
-        number = served.version.number
-        model_documents = [document for document in documents if document["name"] == served.name]
+        policy = await self._inference.find(model, version)
+        model_documents = [document for document in documents if document["name"] == policy.model]
         if version:
-            model_documents = [document for document in model_documents if document["version"] == str(number)]
-        if all(document["version"] != str(number) for document in model_documents):
-            model_documents.append(ModelStatistics().document(served.name, number))
+            model_documents = [document for document in model_documents if document["version"] == str(policy.number)]
+        if all(document["version"] != str(policy.number) for document in model_documents):
+            model_documents.append(ModelStatistics().document(policy.model, policy.number))
         return {"model_stats": model_documents}
 
     async def index(self, only_ready: bool = False) -> list[Document]:
@@ -129,9 +127,9 @@ def _state(is_loaded: bool) -> Document:
     return {"state": "READY"} if is_loaded else {"state": "UNAVAILABLE", "reason": NOT_LOADED}
 
 
-def _tensors(ports: Iterable[TensorSpec]) -> list[Document]:
+def _tensors(ports: Iterable[Port]) -> list[Document]:
     return [{"name": port.name, "datatype": port.datatype, "shape": [-1, *port.leaf.shape]} for port in ports]
 
 
-def _configured(port: TensorSpec) -> Document:
+def _configured(port: Port) -> Document:
     return {"name": port.name, "data_type": f"TYPE_{port.datatype}", "dims": list(port.leaf.shape)}

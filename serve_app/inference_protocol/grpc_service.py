@@ -20,7 +20,8 @@ from serve_app.inference_protocol.field_count import check_fields, malformed
 from serve_app.inference_protocol.inference import Inference, InferRequest, InferResponse
 from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
 from serve_app.inference_protocol.statistics import Document
-from serve_app.inference_protocol.tensors import Data, RequestTensor, Signature, datatype_of, to_bytes
+from serve_app.inference_protocol.tensors import Data, RequestTensor, datatype_of, to_bytes
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.registry_watcher import RegistryWatcher
 from serve_app.runtime.timeouts import TimeLimitExceeded, run_within
 from serve_app.settings import ServeSettings
@@ -42,15 +43,15 @@ CONTENTS = {
 
 
 FEW_TENSORS = 64
-"""Requests with more are compared with the policy's signature before they are read."""
+"""Requests with more are compared with the policy's inputs and outputs before they are read."""
 
 
-def check_counts(request: messages.ModelInferRequest, signature: Signature) -> None:
+def check_counts(request: messages.ModelInferRequest, policy: LoadedPolicy) -> None:
     """Raise InvalidInput if a request has more tensors than a policy."""
     for what, names, most in (
-        ("inputs", request.inputs, signature.inputs),
-        ("raw_input_contents", request.raw_input_contents, signature.inputs),
-        ("outputs", request.outputs, signature.outputs),
+        ("inputs", request.inputs, policy.inputs),
+        ("raw_input_contents", request.raw_input_contents, policy.inputs),
+        ("outputs", request.outputs, policy.outputs),
     ):
         if len(names) > len(most):
             raise InvalidInput(f"the request has {len(names)} {what}, expected at most {len(most)}")
@@ -169,8 +170,7 @@ class InferenceService:
                     return await self._answer(rpc, request)
                 headers = headers_of(metadata)
                 if max(len(request.inputs), len(request.outputs), len(request.raw_input_contents)) > FEW_TENSORS:
-                    served = await self._inference.find(model, request.model_version, headers)
-                    check_counts(request, served.signature)
+                    check_counts(request, await self._inference.find(model, request.model_version, headers))
                 return await self._inference.infer(read_request(request, len(body)), write_response, headers)
         except LeagueError as error:
             self._inference.metrics.count_error(f"/v2/models/{model}", error.code)

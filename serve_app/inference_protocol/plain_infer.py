@@ -13,20 +13,19 @@ from league.policies.onnx import DIST_INPUTS
 from league.policies.policy import Actions
 from serve_app.inference.action_request import Arrays
 from serve_app.inference.plain_format import PlainRequest, Target, Times
-from serve_app.inference.stream_codec import BinaryCodec
+from serve_app.inference.stream_codec import observations_of
 from serve_app.inference_protocol.inference import (
     API,
     Inference,
     InferResponse,
-    ProtocolModel,
     output_of,
     wanted_outputs,
 )
 from serve_app.inference_protocol.rest import BINARY, HEADER_LENGTH, JSON, framing
 from serve_app.inference_protocol.rest_codec import MIN_COMPRESSED_BYTES, RestRequest, read_request, write_response
 from serve_app.inference_protocol.tensors import read_inputs
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.traffic_split import Headers
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 
 MAX_HEAD = 1024
 """Bytes of the largest JSON that is kept."""
@@ -49,42 +48,7 @@ class BinaryTensors(NamedTuple):
 
     layout: Layout
     tensors: Sequence[bytes]
-    model: ProtocolModel
     accepts_compressed: bool
-
-
-class PolicyTensors:
-    """The tensors and layouts of one policy."""
-
-    def __init__(self, policy: LoadedPolicy) -> None:
-        self.codec = BinaryCodec(policy)
-        self._inputs = [name for name, *_ in policy.reader.leaves]
-        self._layouts: dict[bytes, Layout] = {}
-
-    def layout(self, target: Target, body: bytes, length: int, model: ProtocolModel, max_batch: int) -> Layout | None:
-        """The layout of a request; None if an input is JSON. Raises LeagueError."""
-        head = body[:length]
-        layout = self._layouts.get(head)
-        if layout is None:
-            layout = self._parse(target, body, length, model, max_batch)
-            if layout is not None and length <= MAX_HEAD:
-                if len(self._layouts) == MAX_HEADS:
-                    self._layouts.clear()
-                self._layouts[head] = layout
-        return layout
-
-    def _parse(self, target: Target, body: bytes, length: int, model: ProtocolModel, max_batch: int) -> Layout | None:
-        request = read_request(target.model, target.version, body, length)
-        outputs = wanted_outputs(request.infer.outputs, model.signature)
-        arrays = read_inputs(request.infer.inputs, model.signature, max_batch)
-        places, end = {}, length
-        for tensor in request.infer.inputs:
-            if not isinstance(tensor.data, memoryview):
-                return None
-            places[tensor.name] = slice(end, end := end + len(tensor.data))
-        request = request._replace(infer=request.infer._replace(inputs=()))  # which refer to the body
-        rows = len(next(iter(arrays.values())))
-        return Layout(request, outputs, [places[name] for name in self._inputs], len(body), rows)
 
 
 class PlainInfer:
@@ -95,31 +59,58 @@ class PlainInfer:
     def __init__(self, inference: Inference, max_batch: int) -> None:
         self._inference = inference
         self._max_batch = max_batch
-        self._policies: WeakKeyDictionary[LoadedPolicy, PolicyTensors] = WeakKeyDictionary()
+        self._layouts: WeakKeyDictionary[LoadedPolicy, dict[bytes, Layout]] = WeakKeyDictionary()
 
     def in_flight(self) -> int:
         """See `PlainFormat`."""
         return self._inference.in_flight
 
     def parse(
-        self, target: Target, headers: Headers, body: bytes, version: LoadedVersion, policy: LoadedPolicy
+        self, target: Target, headers: Headers, body: bytes, policy: LoadedPolicy
     ) -> tuple[BinaryTensors, int] | None:
         """See `PlainFormat`."""
         length, accepted = framing(headers)
         if length is None or length > len(body):
             return None
-        model, tensors = self._inference.of_loaded(target.model, version, policy), self._of(policy)
-        layout = tensors.layout(target, body, length, model, self._max_batch)
+        layout = self._layout(target, body, length, policy)
         if layout is None or len(body) != layout.size:
             return None
-        return BinaryTensors(layout, [body[part] for part in layout.tensors], model, bool(accepted)), layout.rows
+        return BinaryTensors(layout, [body[part] for part in layout.tensors], bool(accepted)), layout.rows
+
+    def _layout(self, target: Target, body: bytes, length: int, policy: LoadedPolicy) -> Layout | None:
+        """The layout of a request; None if an input is JSON. Raises LeagueError."""
+        layouts = self._layouts.get(policy)
+        if layouts is None:
+            layouts = self._layouts[policy] = {}
+        head = body[:length]
+        layout = layouts.get(head)
+        if layout is None:
+            layout = self._parse(target, body, length, policy)
+            if layout is not None and length <= MAX_HEAD:
+                if len(layouts) == MAX_HEADS:
+                    layouts.clear()
+                layouts[head] = layout
+        return layout
+
+    def _parse(self, target: Target, body: bytes, length: int, policy: LoadedPolicy) -> Layout | None:
+        request = read_request(target.model, target.version, body, length)
+        outputs = wanted_outputs(request.infer.outputs, policy)
+        arrays = read_inputs(request.infer.inputs, policy, self._max_batch)
+        places, end = {}, length
+        for tensor in request.infer.inputs:
+            if not isinstance(tensor.data, memoryview):
+                return None
+            places[tensor.name] = slice(end, end := end + len(tensor.data))
+        request = request._replace(infer=request.infer._replace(inputs=()))  # which refer to the body
+        rows = len(next(iter(arrays.values())))
+        return Layout(request, outputs, [places[port.name] for port in policy.observed], len(body), rows)
 
     def read(self, policy: LoadedPolicy, contents: Sequence[BinaryTensors], rows: int) -> Arrays:
         """See `PlainFormat`."""
-        codec = self._of(policy).codec
         if len(contents) == 1:
-            return codec.arrays(contents[0].tensors, rows)
-        return codec.arrays(map(b"".join, zip(*(content.tensors for content in contents), strict=True)), rows)
+            return observations_of(policy, contents[0].tensors, rows)
+        tensors = map(b"".join, zip(*(content.tensors for content in contents), strict=True))
+        return observations_of(policy, tensors, rows)
 
     def run(self, policy: LoadedPolicy, arrays: Arrays, contents: Sequence[BinaryTensors], _: int) -> Actions:
         """See `PlainFormat`."""
@@ -136,7 +127,7 @@ class PlainInfer:
         content: BinaryTensors = request.content
         outputs = {name: output_of(name, output)[rows] for name in content.layout.outputs}
         response = InferResponse(
-            request.target.model, str(request.version.number), content.layout.request.infer.id, outputs
+            request.target.model, str(request.policy.number), content.layout.request.infer.id, outputs
         )
         body, length = write_response(response, content.layout.request)
         if content.accepts_compressed and len(body) >= MIN_COMPRESSED_BYTES:
@@ -151,11 +142,5 @@ class PlainInfer:
 
     def count(self, request: PlainRequest, times: Times, is_first: bool) -> None:
         """See `PlainFormat`."""
-        entry = self._inference.statistics.entry(request.content.model.name, request.version.number)
+        entry = self._inference.statistics.entry(request.policy.model, request.policy.number)
         entry.succeed(request.rows, request.time, *times, perf_counter_ns(), int(is_first))
-
-    def _of(self, policy: LoadedPolicy) -> PolicyTensors:
-        tensors = self._policies.get(policy)
-        if tensors is None:
-            tensors = self._policies[policy] = PolicyTensors(policy)
-        return tensors

@@ -251,8 +251,8 @@ class InferRoute:
             self._access.admit_body(scope.get(KEY), len(body))
         model, version = scope["path_params"]["model"], scope["path_params"].get("version", "")
         if is_large:
-            served = await self._inference.find(model, version)
-            served.policy.limits.check_body(memoryview(body)[:header_length], self._settings.max_batch)
+            policy = await self._inference.find(model, version)
+            policy.limits.check_body(memoryview(body)[:header_length], self._settings.max_batch)
             request = await asyncio.to_thread(read_request, model, version, body, header_length)
         else:
             request = read_request(model, version, body, header_length)

@@ -13,7 +13,8 @@ from functools import partial
 from league.errors import LeagueError, NotReady, UnknownAlias
 from league.refs import CHAMPION
 from league.registry.storage.rows import VersionState
-from serve_app.live_versions.version_cache import LoadedVersion, VersionCache, VersionKey
+from serve_app.live_versions.policies import LoadedVersion
+from serve_app.live_versions.version_cache import VersionCache, VersionKey
 from serve_app.runtime.ray_serve import logger
 
 Alias = tuple[str, str]

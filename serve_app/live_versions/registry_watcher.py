@@ -20,10 +20,11 @@ from league.registry.replicas import KEPT
 from league.registry.storage.rows import AliasTarget, ChangeCounts, KeyRow, ReadPosition, ServedState, VersionState
 from league.registry.storage.rows import Traffic as Setting
 from serve_app.live_versions.alias_slots import Alias, AliasSlots
+from serve_app.live_versions.policies import ActionSelections
 from serve_app.live_versions.polling import JITTER, Polling
 from serve_app.live_versions.registry_connection import SHUTDOWN_TIMEOUT, RegistryConnection
 from serve_app.live_versions.traffic_split import TrafficSplit, pinned_slots
-from serve_app.live_versions.version_cache import ActionSelections, VersionKey
+from serve_app.live_versions.version_cache import VersionKey
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.replica_process import ReplicaProcess
 from serve_app.settings import ServeSettings

@@ -11,8 +11,9 @@ from league.refs import CHAMPION, CheckpointRef, PolicyRef, parse_version
 from league.registry.registry import Registry
 from league.registry.storage.database import before
 from serve_app.live_versions.alias_slots import AliasSlots
+from serve_app.live_versions.policies import LoadedPolicy, LoadedVersion
 from serve_app.live_versions.traffic_split import Headers, TrafficSplit, acting
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion, VersionCache
+from serve_app.live_versions.version_cache import VersionCache
 
 T = TypeVar("T")
 
@@ -32,10 +33,8 @@ class ModelResolver:
         self._threads = ThreadPoolExecutor(max_workers=4, thread_name_prefix="registry")
         self._changes = ThreadPoolExecutor(max_workers=2, thread_name_prefix="changes")
 
-    async def find(
-        self, model: str, version: str = CHAMPION, headers: Headers = ()
-    ) -> tuple[LoadedVersion, LoadedPolicy]:
-        """The version and policy of `model` (`{league}` or `{league}.{policy}`) at `version`, a number or an alias.
+    async def find(self, model: str, version: str = CHAMPION, headers: Headers = ()) -> LoadedPolicy:
+        """The policy of `model` (`{league}` or `{league}.{policy}`) at `version`, a number or an alias.
 
         headers: those of the request; the caller's key may route a request for the champion to the canary, and selects
         the member of a mixture. Raises
@@ -49,9 +48,7 @@ class ModelResolver:
             return self._acting(await self._versions.get(ref.league, requested), ref, headers)
         return self._acting(await self._resolve(ref.league, requested), ref, headers, requested == CHAMPION)
 
-    def find_loaded(
-        self, model: str, version: str = CHAMPION, headers: Headers = ()
-    ) -> tuple[LoadedVersion, LoadedPolicy] | None:
+    def find_loaded(self, model: str, version: str = CHAMPION, headers: Headers = ()) -> LoadedPolicy | None:
         """Like `find`, but None if the version is not in memory."""
         ref, requested = policy_ref(model), version_of(version)
         if isinstance(requested, int):
@@ -62,12 +59,12 @@ class ModelResolver:
 
     def _acting(
         self, version: LoadedVersion, ref: PolicyRef, headers: Headers, is_champion: bool = False
-    ) -> tuple[LoadedVersion, LoadedPolicy]:
+    ) -> LoadedPolicy:
         if is_champion and self._traffic.canaries:
             version = self._traffic.route(version, headers)
         if version.mixture is not None:
             version = acting(version, headers)
-        return version, version.policy(ref.policy)
+        return version.policy(ref.policy)
 
     async def members(self, model: str, version: str) -> Collection[int]:
         """The members of a mixture that is named by its number; none of another version or an alias.

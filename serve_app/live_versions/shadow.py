@@ -29,9 +29,8 @@ from league.random.seeds import generators
 from league.registry.storage.rows import ShadowCounts
 from league.search.searched_actions import SearchedActions
 from serve_app.live_versions.alias_slots import AliasSlots
-from serve_app.live_versions.resolver import policy_ref
+from serve_app.live_versions.policies import Graph, LoadedPolicy, LoadedVersion
 from serve_app.live_versions.traffic_split import TrafficSplit, acting
-from serve_app.live_versions.version_cache import Graph, LoadedPolicy, LoadedVersion
 from serve_app.runtime.ray_serve import logger
 from serve_app.settings import ServeSettings
 
@@ -53,8 +52,7 @@ class MirroredRequest(NamedTuple):
     """A queued request."""
 
     candidate: LoadedVersion
-    champion: LoadedVersion
-    policy: str | None
+    champion: LoadedPolicy
     observations: Arrays
     actions: NDArray | None
 
@@ -103,22 +101,22 @@ class Shadow:
         self._bytes = 0
         self._is_scheduled = False
 
-    def mirror_for(self, model: str, version: LoadedVersion) -> MirrorFunction | None:
-        """The function that mirrors a request of `model` answered by `version`; None if it is not mirrored."""
-        target = self._traffic.shadows.get(version.league)
+    def mirror_for(self, policy: LoadedPolicy) -> MirrorFunction | None:
+        """The function that mirrors a request that `policy` answers; None if it is not mirrored."""
+        target = self._traffic.shadows.get(policy.league)
         if target is None or (target.share < 1 and random() >= target.share):
             return None
-        candidate, champion = self._slots.get(version.league, target.slot), self._slots.champion(version.league)
+        candidate, champion = self._slots.get(policy.league, target.slot), self._slots.champion(policy.league)
         if candidate is None or champion is None or candidate is champion:
             return None
-        if version is not champion and version not in champion.members:
+        if all(version.policies.get(policy.name) is not policy for version in (champion, *champion.members)):
             return None
-        if (candidate := acting(candidate, ())) is version:
+        candidate = acting(candidate, ())
+        if candidate.policies.get(policy.name) is policy:
             return None
-        policy = policy_ref(model).policy
 
         def mirror(observations: Arrays, state: Arrays | None, actions: NDArray | None) -> None:
-            request = MirroredRequest(candidate, version, policy, observations, actions)
+            request = MirroredRequest(candidate, policy, observations, actions)
             counts = self._counts_of(_pair(request))
             if state is not None:  # it would be another network's
                 counts.skipped += 1
@@ -179,7 +177,7 @@ class Shadow:
             shadow = None if target is None else self._slots.get(candidate.league, target.slot)
             if shadow is None or all(candidate is not version for version in (shadow, *shadow.members)):
                 for policy in candidate.policies.values():
-                    policy.shadow_policy.end_runs()
+                    policy.shadow_graph.end_runs()
         asyncio.get_running_loop().call_later(BATCH_WINDOW, self._end_if_off, computing, candidates)
 
     def _finish_batch(self, computing: asyncio.Future[tuple[list[ShadowResult], float]]) -> None:
@@ -208,9 +206,9 @@ class Shadow:
 def compare(requests: Sequence[MirroredRequest]) -> tuple[list[ShadowResult], float]:
     """Run candidates on requests; returns the results and the CPU time in seconds."""
     start = thread_time_ns()
-    alike: dict[tuple[int, int, str | None], list[MirroredRequest]] = {}
+    alike: dict[tuple[int, int], list[MirroredRequest]] = {}
     for request in requests:
-        alike.setdefault((id(request.candidate), id(request.champion), request.policy), []).append(request)
+        alike.setdefault((id(request.candidate), id(request.champion)), []).append(request)
     outcomes = []
     for group in alike.values():
         first, later_requests = group[:1], group[1:]
@@ -237,19 +235,19 @@ def _batches(requests: Sequence[MirroredRequest]) -> list[list[MirroredRequest]]
 def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> ShadowResult:
     outcome = ShadowResult(_pair(requests[0]))
     try:
-        candidate = requests[0].candidate.policy(requests[0].policy)
+        champion = requests[0].champion
+        candidate = requests[0].candidate.policy(champion.name)
         names = requests[0].observations
         observations = {name: np.concatenate([request.observations[name] for request in requests]) for name in names}
         seeds = np.random.default_rng().integers(2**63, size=sum(map(_rows, requests)))
         start = thread_time_ns()
-        answer = _act(candidate, candidate.shadow_policy, observations, seeds)
+        answer = _act(candidate, candidate.shadow_graph, observations, seeds)
         actions, searched_ns = answer.actions, answer.ns if isinstance(answer, SearchedActions) else 0
         cpu_ns = thread_time_ns() - start + searched_ns
-        champion = requests[0].champion.policy(requests[0].policy)
         recorded = [request.actions for request in requests if request.actions is not None]
         # The champion's actions are recomputed if they were or are to be sampled.
         if champion.samples or len(recorded) < len(requests):
-            expected = _act(champion, champion.policy, observations, seeds).actions
+            expected = _act(champion, champion.graph, observations, seeds).actions
         else:
             expected = np.concatenate(recorded)
         outcome.agreed = int(same(actions, expected, candidate.manifest.action, TOLERANCE).sum())

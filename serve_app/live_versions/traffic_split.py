@@ -15,7 +15,7 @@ from league.registry.storage.manifest import episode_position
 from league.registry.storage.rows import Portion
 from league.registry.storage.rows import Traffic as Setting
 from serve_app.live_versions.alias_slots import Alias, AliasSlots
-from serve_app.live_versions.version_cache import LoadedVersion
+from serve_app.live_versions.policies import LoadedVersion
 
 KEY = b"x-league-key"
 """Header that names what must stay with one version, such as a player or an episode."""

@@ -1,16 +1,13 @@
 """Loads versions from the artefact store, verifies their probes, and caches them."""
 
 import asyncio
-import os
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Set
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from league.conditions import ActionSelection
 from league.errors import (
     ArtifactCorrupt,
     DeadlineExceeded,
@@ -18,118 +15,21 @@ from league.errors import (
     InvalidInput,
     NoSearchService,
     Overloaded,
-    UnknownPolicy,
     VersionRetired,
 )
 from league.policies.onnx import RUN_TIMEOUT, OnnxPolicy
-from league.policies.policy import Actions, Policy
+from league.policies.policy import Policy
 from league.policies.probes import Probes
 from league.registry.registry import Registry
-from league.registry.storage.manifest import Mixture, PolicyManifest
+from league.registry.storage.manifest import PolicyManifest
 from league.registry.storage.rows import VersionRow, VersionState
-from league.spaces import Box, Leaf
 from league.spaces.observation_codec import ObservationReader
-from serve_app.codecs.request_limits import RequestLimits
-from serve_app.live_versions.remote_search import SEARCHES, RemoteSearch, SearchClient
+from serve_app.live_versions.policies import ActionSelections, Graph, LoadedPolicy, LoadedVersion
+from serve_app.live_versions.remote_search import RemoteSearch, SearchClient
 from serve_app.runtime.background import in_daemon_thread
 
-SHADOW_TIMEOUT = 1.0
-"""Seconds after which a run of a shadow is ended, and counted as failed."""
-INLINE_TIMEOUT = 0.5
-"""Seconds after which a run on the event loop is ended, and repeated in a thread."""
-RUNS_IN_THREADS = min(32, (os.cpu_count() or 1) + 4) // 2
-"""Runs of one policy in threads at a time: half of the threads of asyncio's default executor, so that a slow policy
-leaves the others to the rest of the replica."""
 WARM_BATCH = 64
 """Large enough to measure the time per row, small enough to run in milliseconds."""
-
-ActionSelections = dict[str, ActionSelection]
-"""league → how its versions select actions if a request does not say. All of them share it, so that a change reaches
-all at once."""
-
-Graph = OnnxPolicy | RemoteSearch
-"""What computes the actions of a policy."""
-
-
-@dataclass(slots=True, eq=False, weakref_slot=True)
-class LoadedPolicy:
-    """One policy, ready for inference."""
-
-    policy: Graph
-    manifest: PolicyManifest
-    reader: ObservationReader
-    state: tuple[tuple[str, Leaf], ...]
-    """Recurrent inputs; empty for a feed-forward policy."""
-    limits: RequestLimits
-    inline_rows: int
-    """The largest batch that is fast enough to run on the event loop. 0 after one was not."""
-    league: str
-    selections: ActionSelections
-    inline_policy: Graph = field(init=False)
-    """The same for runs on the event loop."""
-    shadow_policy: Graph = field(init=False)
-    """The same for runs of a shadow, which can be ended."""
-    _threads: asyncio.Semaphore = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._threads = asyncio.Semaphore(SEARCHES if self.search is not None else RUNS_IN_THREADS)
-        self.inline_policy = self.policy.within(INLINE_TIMEOUT)
-        self.shadow_policy = self.policy.within(SHADOW_TIMEOUT, can_end=True)
-
-    @property
-    def search(self) -> RemoteSearch | None:
-        """The policy if it searches."""
-        return self.policy if isinstance(self.policy, RemoteSearch) else None
-
-    async def run(self, act: Callable[[Graph], Actions], rows: int) -> Actions:
-        """Call `act` with the policy, in a thread if the batch is large. Raises the errors of `act`."""
-        if rows <= self.inline_rows:
-            with suppress(GraphTimeout):
-                return self.run_inline(act)
-        async with self._threads:
-            threads = None if self.search is None else self.search.threads
-            return await asyncio.get_running_loop().run_in_executor(threads, act, self.policy)
-
-    def run_inline(self, act: Callable[[Graph], Actions]) -> Actions:
-        """Call `act` with the policy on the event loop. Raises the errors of `act`."""
-        try:
-            return act(self.inline_policy)
-        except GraphTimeout:
-            self.inline_rows = 0
-            raise
-
-    @property
-    def samples(self) -> bool:
-        """Whether actions are sampled if a request does not say, as in the league's matches."""
-        return self.policy.has_distribution and self.selections[self.league] == "sampled"
-
-
-@dataclass(frozen=True, slots=True)
-class LoadedVersion:
-    """A version of a league, verified, loaded and warmed up."""
-
-    league: str
-    number: int
-    sha256: str
-    """Digest of the version's manifest.json, which contains the digests of all its files."""
-    policies: dict[str, LoadedPolicy]
-    mixture: Mixture | None = None
-    """The members of a mixture and their probabilities; None for other versions."""
-    members: tuple["LoadedVersion", ...] = ()
-    """The loaded members of a mixture, in the same order. They act in its place."""
-
-    def policy(self, name: str | None) -> LoadedPolicy:
-        """A policy by name; None selects the only policy. Raises UnknownPolicy."""
-        if name is None and len(self.policies) == 1:
-            return next(iter(self.policies.values()))
-        if name not in self.policies:
-            problem = f"has no policy {name!r}" if name else f"has several policies: request {self.league}.POLICY"
-            raise UnknownPolicy(f"{self.league}@{self.number} {problem}; known: {', '.join(self.policies)}")
-        return self.policies[name]
-
-    def model(self, policy: LoadedPolicy) -> str:
-        """`{league}.{policy}`, the name of one of its policies."""
-        return f"{self.league}.{next(name for name, one in self.policies.items() if one is policy)}"
 
 
 def load(
@@ -165,19 +65,19 @@ def load(
             raise NoSearchService("this server has no search service: `search_service` is not set in its deploy.yaml")
         base = registry.versions.get(league, version.search.version)
         return _load_search(version, base, search, selections, timeout, load_timeout)
-    policies: dict[str, LoadedPolicy] = {}
+    graphs: dict[str, tuple[PolicyManifest, Graph, int]] = {}
     for name, manifest in version.manifest.policies.items():
         # Each file is verified as it is read. The others, such as the state of training, can be large.
-        graph = registry.artifacts.read(version.manifest, manifest.file)
-        policy = OnnxPolicy(graph, manifest, version.manifest.has_distribution, timeout)
+        content = registry.artifacts.read(version.manifest, manifest.file)
+        graph = OnnxPolicy(content, manifest, version.manifest.has_distribution, timeout)
         try:
             if manifest.probes is not None:
                 probes = Probes.from_bytes(registry.artifacts.read(version.manifest, manifest.probes), manifest.probes)
-                probes.check(policy, manifest.action, f"{version.ref}: {manifest.probes}")
-            policies[name] = _warm_up(policy, manifest, inline, league, selections)
+                probes.check(graph, manifest.action, f"{version.ref}: {manifest.probes}")
+            graphs[name] = manifest, graph, _inline_rows(graph, ObservationReader(manifest.observation), inline)
         except (InvalidInput, GraphTimeout) as error:
             raise ArtifactCorrupt(f"policy {name} of {version.ref} does not run: {error}") from error
-    return LoadedVersion(league, number, version.sha256, policies)
+    return _loaded(version, graphs, selections)
 
 
 def _load_search(
@@ -189,52 +89,43 @@ def _load_search(
     load_timeout: float,
 ) -> LoadedVersion:
     """Let the search service load a version that plays `base`. Its searches never run on the event loop."""
-    policies = {}
+    graphs: dict[str, tuple[PolicyManifest, Graph, int]] = {}
     for name, manifest in base.manifest.policies.items():
-        policy = RemoteSearch(search, version, name, manifest.action, timeout)
-        policy.load(load_timeout)
-        policies[name] = _prepared(policy, manifest, 0, version.league, selections)
+        graph = RemoteSearch(search, version, name, manifest.action, timeout)
+        graph.load(load_timeout)
+        graphs[name] = manifest, graph, 0
+    return _loaded(version, graphs, selections)
+
+
+def _loaded(
+    version: VersionRow, graphs: Mapping[str, tuple[PolicyManifest, Graph, int]], selections: ActionSelections
+) -> LoadedVersion:
+    """graphs: policy → manifest, graph, and the rows that it runs on the event loop."""
+    policies = {
+        name: LoadedPolicy(
+            version.league, version.number, version.sha256, name, len(graphs) == 1, manifest, graph, selections, rows
+        )
+        for name, (manifest, graph, rows) in graphs.items()
+    }
     return LoadedVersion(version.league, version.number, version.sha256, policies)
 
 
-def _warm_up(
-    policy: OnnxPolicy, manifest: PolicyManifest, inline: float, league: str, selections: ActionSelections
-) -> LoadedPolicy:
+def _inline_rows(graph: OnnxPolicy, reader: ObservationReader, inline: float) -> int:
     """Run the graph to allocate its memory, and measure how many rows fit into `inline` seconds."""
-    reader = ObservationReader(manifest.observation)
-    one, many = (_measure(policy, reader, rows) for rows in (1, WARM_BATCH))
+    one, many = (_measure(graph, reader, rows) for rows in (1, WARM_BATCH))
     per_row = max(many - one, 1e-9) / (WARM_BATCH - 1)
-    rows = 0 if one > inline else 1 + int((inline - one) / per_row)
-    return _prepared(policy, manifest, rows, league, selections)
+    return 0 if one > inline else 1 + int((inline - one) / per_row)
 
 
-def _prepared(
-    policy: Graph, manifest: PolicyManifest, rows: int, league: str, selections: ActionSelections
-) -> LoadedPolicy:
-    """rows: the largest batch that runs on the event loop."""
-    reader = ObservationReader(manifest.observation)
-    state = tuple(
-        (tensor.name, Box(dtype=tensor.dtype, shape=_sizes(tensor.shape[1:]), low=None, high=None))
-        for tensor in manifest.state
-    )
-    limits = RequestLimits.of([leaf for *_, leaf in reader.leaves] + [leaf for _, leaf in state])
-    return LoadedPolicy(policy, manifest, reader, state, limits, rows, league, selections)
-
-
-def _measure(policy: Policy, reader: ObservationReader, rows: int) -> float:
+def _measure(graph: Policy, reader: ObservationReader, rows: int) -> float:
     """Seconds of the fastest of a few runs: slower ones shared the processor."""
     observations = reader.zeros(rows)
     durations = []
     for _ in range(4):
         start = time.perf_counter()
-        policy.act(observations)
+        graph.act(observations)
         durations.append(time.perf_counter() - start)
     return float(np.min(durations))
-
-
-def _sizes(shape: tuple[int | None, ...]) -> tuple[int, ...]:
-    assert None not in shape, "only the batch dimension is dynamic"
-    return tuple(size for size in shape if size is not None)
 
 
 VersionKey = tuple[str, int]

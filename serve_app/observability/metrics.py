@@ -14,10 +14,9 @@ from typing import Any
 from league.histograms import Histogram
 from serve_app.access.permissions import league_of
 from serve_app.live_versions.alias_slots import AliasSlots
-from serve_app.live_versions.resolver import policy_ref
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.shadow import Shadow
 from serve_app.live_versions.traffic_split import TrafficSplit
-from serve_app.live_versions.version_cache import LoadedVersion
 
 MAX_SERIES = 1024
 """Maximum policies and versions with counts; the least recently used are dropped."""
@@ -28,7 +27,7 @@ REJECTIONS = ("unauthenticated", "forbidden", "rate_limited")
 MEMORY, PAGE_SIZE = Path("/proc/self/statm"), 4096
 """The second number of the file is that of resident pages."""
 
-Label = tuple[str, str, str, str]
+Label = tuple[str, str, int, str]
 """league, policy, version, api"""
 Samples = list[list[Any]]
 """[[label values, value]]; the value of a histogram is {counts, sum}."""
@@ -62,15 +61,17 @@ class Metrics:
         self._traffic = traffic
         self._shadow = shadow
         self._served: dict[Label, RequestStats] = {}
-        self._by_request: dict[tuple[str, str, int], RequestStats] = {}
         self._errors: Counter[tuple[str, str]] = Counter()
         self._started_at = time()
 
-    def count_request(self, api: str, model: str, version: LoadedVersion, rows: int, ns: int) -> None:
+    def count_request(self, api: str, policy: LoadedPolicy, rows: int, ns: int) -> None:
         """Count a request of `rows` observations that took `ns` nanoseconds."""
-        served = self._by_request.get((api, model, version.number))
+        label = (policy.league, policy.name, policy.number, api)
+        served = self._served.get(label)
         if served is None:
-            served = self._first(api, model, version)
+            if len(self._served) >= MAX_SERIES:
+                del self._served[min(self._served, key=lambda known: self._served[known].used_at)]
+            served = self._served[label] = RequestStats(used_at=monotonic())
         served.add(rows, ns)
 
     def count_error(self, path: str, code: str) -> None:
@@ -91,17 +92,6 @@ class Metrics:
         """All counts."""
         return self._requests() | self._state() | self._mirrored()
 
-    def _first(self, api: str, model: str, version: LoadedVersion) -> RequestStats:
-        policy = policy_ref(model).policy or next(iter(version.policies))
-        label = (version.league, policy, str(version.number), api)
-        if label not in self._served and len(self._served) >= MAX_SERIES:
-            forgotten = min(self._served, key=lambda known: self._served[known].used_at)
-            gone = self._served.pop(forgotten)
-            self._by_request = {request: served for request, served in self._by_request.items() if served is not gone}
-        served = self._served.setdefault(label, RequestStats(used_at=monotonic()))
-        self._by_request[api, model, version.number] = served
-        return served
-
     def _requests(self) -> Report:
         seconds: Samples = []
         sizes: Samples = []
@@ -109,8 +99,9 @@ class Metrics:
             count = served.latency.count
             if count != served.reported:
                 served.reported, served.used_at = count, monotonic()
-            seconds.append([list(label), {"counts": list(served.latency.counts), "sum": served.latency.ns / 1e9}])
-            sizes.append([list(label), {"counts": list(served.sizes), "sum": served.observations}])
+            labels = list(map(str, label))
+            seconds.append([labels, {"counts": list(served.latency.counts), "sum": served.latency.ns / 1e9}])
+            sizes.append([labels, {"counts": list(served.sizes), "sum": served.observations}])
         errors: Samples = [[[league, code], count] for (league, code), count in self._errors.items()]
         rejected: Samples = [
             [[code], sum(count for (_, other), count in self._errors.items() if other == code)] for code in REJECTIONS

@@ -1,7 +1,7 @@
 """Builds the OpenAPI document: the declared routes, with the limits of this server and examples for its policies."""
 
 from base64 import b64encode
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from copy import deepcopy
 from functools import cache
 from importlib.metadata import version as installed
@@ -17,8 +17,7 @@ from PIL import Image
 
 from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space, inputs
 from league.spaces.arrays import bounds, nested
-from serve_app.inference_protocol.tensors import datatype_of
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
+from serve_app.live_versions.policies import LoadedPolicy, LoadedVersion
 from serve_app.openapi.operations import KEY, Document, describe
 from serve_app.routes.table import ROUTES
 from serve_app.settings import ServeSettings
@@ -39,7 +38,7 @@ def document(settings: ServeSettings, served: Iterable[LoadedVersion]) -> Docume
         f"\n**Limits.** {settings.max_body:,} bytes and {settings.max_batch:,} observations per request, "
         f"{settings.max_in_flight:,} concurrent requests, a timeout of {settings.timeout:g} s.\n"
     )
-    policies = dict(_named(served))
+    policies = {policy.model: policy for version in served for policy in version.policies.values()}
     if policies:
         _show(described, policies)
     return described
@@ -76,12 +75,6 @@ def _key(model: str) -> str:
     return f"of_{model}"
 
 
-def _named(served: Iterable[LoadedVersion]) -> Iterator[tuple[str, LoadedPolicy]]:
-    for version in served:
-        for name, policy in version.policies.items():
-            yield version.league if len(version.policies) == 1 else f"{version.league}.{name}", policy
-
-
 @cache
 def _source() -> Document:
     """The document without what depends on the server."""
@@ -108,13 +101,13 @@ def action_request(policy: LoadedPolicy) -> dict[str, Any]:
 
 def infer_request(policy: LoadedPolicy) -> dict[str, Any] | None:
     """An example body for the Open Inference Protocol in JSON; None if it would be too long."""
-    arrays = {name: _zeros(leaf, (1, *leaf.shape), name == ACTION_MASK) for name, _, leaf in policy.reader.leaves}
-    if sum(array.size for array in arrays.values()) > MAX_LISTED:
+    if sum(prod(port.leaf.shape) for port in policy.observed) > MAX_LISTED:
         return None
+    arrays = [_zeros(port.leaf, (1, *port.leaf.shape), port.name == ACTION_MASK) for port in policy.observed]
     return {
         "inputs": [
-            {"name": name, "datatype": datatype_of(array), "shape": list(array.shape), "data": array.ravel().tolist()}
-            for name, array in arrays.items()
+            {"name": port.name, "datatype": port.datatype, "shape": list(array.shape), "data": array.ravel().tolist()}
+            for port, array in zip(policy.observed, arrays, strict=True)
         ],
         "outputs": [{"name": "action"}],
     }

@@ -40,9 +40,9 @@ from serve_app.inference.action_request import (
     read_observations,
     reject_unknown_keys,
 )
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.resolver import ModelResolver
 from serve_app.live_versions.shadow import MirrorFunction, Shadow
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.observability.metrics import Metrics
 from serve_app.routes.query_string import query_params
 from serve_app.settings import ServeSettings
@@ -118,7 +118,7 @@ class ActionRoute:
             self._access.admit_body(scope.get(KEY), len(body))
         if is_large:
             with suppress(NotReady):  # without a champion, a token in the body may name the version
-                _, policy = await self._models.find(model, requested)
+                policy = await self._models.find(model, requested)
                 policy.limits.check_body(body, self._settings.max_batch)
             document = await asyncio.to_thread(parse_json_object, body)
         else:
@@ -127,16 +127,15 @@ class ActionRoute:
         request = parse_action_request(document, self._settings.max_batch)
         members = await self._models.members(model, requested) if request.tokens and any(request.tokens) else ()
         requested = pinned_version(request, model, requested, members)
-        version, policy = await self._models.find(model, requested, scope["headers"])
-        response = await _response(request, body, version, policy, self._shadow.mirror_for(model, version))
-        response |= {"model": model, "version": version.number, "sha256": version.sha256}
+        policy = await self._models.find(model, requested, scope["headers"])
+        response = await _response(request, body, policy, self._shadow.mirror_for(policy))
         if LOG_ENTRY in scope:
-            log_version(scope, model, version.number)
-        content = orjson.dumps(response)
+            log_version(scope, model, policy.number)
+        content = orjson.dumps(response)[:-1] + policy.signature(model)
         headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(content)), self._replica]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": content})
-        self._metrics.count_request(API, model, version, len(request.observations), perf_counter_ns() - start)
+        self._metrics.count_request(API, policy, len(request.observations), perf_counter_ns() - start)
 
 
 class ActionDispatch:
@@ -161,13 +160,12 @@ class ActionDispatch:
 async def _response(
     request: DecodedActionRequest,
     body: bytes,
-    version: LoadedVersion,
     policy: LoadedPolicy,
     mirror: MirrorFunction | None,
 ) -> dict[str, Any]:
     plain = is_plain(request, policy, body.count(b'"'))
     observations = await read_observations(request, policy, plain, len(body))
-    state = decode_state(request, version, policy, not plain)
+    state = decode_state(request, policy, not plain)
     output, is_greedy = await execute_request(request, policy, observations, state)
     if mirror is not None:
         mirror(observations, state, output.actions if is_greedy else None)
@@ -176,6 +174,6 @@ async def _response(
         if request.state is not None:
             response["state"] = {name: array.tolist() for name, array in output.state.items()}
         else:
-            tokens = encode_state(output, version, policy)
+            tokens = encode_state(output.state, policy)
             response["state"] = tokens if request.is_batch else tokens[0]
     return response

@@ -27,7 +27,7 @@ import serve_app
 from serve_app.access.access_control import AccessControl
 from serve_app.declaration import Declaration
 from serve_app.live_versions.alias_slots import AliasSlots
-from serve_app.live_versions.version_cache import LoadedVersion
+from serve_app.live_versions.policies import LoadedVersion
 
 PAGE = Path(serve_app.__file__).parent / "openapi" / "page.html"
 FRESH = {"cache-control": "no-cache", "vary": "authorization, x-api-key"}

@@ -34,9 +34,9 @@ from serve_app.inference.stream_session import InferenceDependencies
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.plain_infer import PlainInfer
 from serve_app.inference_protocol.rest import HEADER_LENGTH
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.resolver import policy_ref
 from serve_app.live_versions.traffic_split import Headers
-from serve_app.live_versions.version_cache import LoadedPolicy, LoadedVersion
 from serve_app.routes.action import API, PATH_PREFIX, PATH_SUFFIX, ActionRoute
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_http import HttpProtocol
@@ -66,9 +66,7 @@ class JsonActions:
         """See `PlainFormat`."""
         return self._route.in_flight
 
-    def parse(
-        self, _: Target, __: Headers, body: bytes, ___: LoadedVersion, policy: LoadedPolicy
-    ) -> tuple["JsonObservations", int] | None:
+    def parse(self, _: Target, __: Headers, body: bytes, policy: LoadedPolicy) -> tuple["JsonObservations", int] | None:
         """See `PlainFormat`."""
         document = orjson.loads(body)
         if type(document) is not dict or len(document) != 1:
@@ -100,9 +98,9 @@ class JsonActions:
 
     def write(self, request: PlainRequest, output: Actions, rows: slice) -> tuple[bytes, bytes]:
         """See `PlainFormat`."""
-        version, actions = request.version, output.actions[rows].tolist()
+        actions = output.actions[rows].tolist()
         name, value = (b'{"actions":', actions) if request.content.is_batch else (b'{"action":', actions[0])
-        content = name + orjson.dumps(value) + _signature(request.target.model, version.number, version.sha256)
+        content = name + orjson.dumps(value) + request.policy.signature(request.target.model)
         return b"content-type: application/json\r\ncontent-length: %d\r\n" % len(content), content
 
     def count(self, _: PlainRequest, __: Times, ___: bool) -> None:
@@ -238,16 +236,15 @@ class PlainActions:
         try:
             if policy_ref(target.model).league in self._traffic.canaries:
                 return None
-            loaded = self._models.find_loaded(target.model, target.version, scope["headers"])
-            if loaded is None or loaded[1].state:
+            policy = self._models.find_loaded(target.model, target.version, scope["headers"])
+            if policy is None or policy.state:
                 return None
-            version, policy = loaded
-            parsed = format_of.parse(target, scope["headers"], connection.body, version, policy)
+            parsed = format_of.parse(target, scope["headers"], connection.body, policy)
         except (orjson.JSONDecodeError, KeyError, LeagueError):
             return None
         if parsed is None or parsed[1] > policy.inline_rows:
             return None
-        return policy, format_of, PlainRequest(connection, time, target, version, *parsed, admission.key is not None)
+        return policy, format_of, PlainRequest(connection, time, target, policy, *parsed, admission.key is not None)
 
     def _answer(self, policy: LoadedPolicy, format_of: PlainFormat, requests: list[PlainRequest]) -> None:
         contents, rows = [request.content for request in requests], sum(request.rows for request in requests)
@@ -272,15 +269,13 @@ class PlainActions:
             if response is None:
                 request.connection.pass_on()
                 continue
-            target, (head, content) = request.target, response
-            mirror = self._shadow.mirror_for(target.model, request.version)
+            head, content = response
+            mirror = self._shadow.mirror_for(policy)
             if mirror is not None:
                 mirrored: Arrays = {name: array[part] for name, array in arrays.items()}
                 mirror(mirrored, None, output.actions[part] if is_greedy else None)
             self._reply(request, head, content)
-            self._metrics.count_request(
-                format_of.api, target.model, request.version, request.rows, perf_counter_ns() - request.time
-            )
+            self._metrics.count_request(format_of.api, policy, request.rows, perf_counter_ns() - request.time)
             format_of.count(request, times, part.start == 0)
 
     def _reply(self, request: PlainRequest, head: bytes, content: bytes) -> None:
@@ -329,9 +324,3 @@ def _cached_target(url: bytes, root_path: str) -> Target | None:
         case [model, "versions", version, "infer"] if model and version:
             return Target(path, model, version, False)
     return None
-
-
-@lru_cache(maxsize=1024)
-def _signature(model: str, version: int, sha256: str) -> bytes:
-    """The rest of a response, after the actions."""
-    return b"," + orjson.dumps({"model": model, "version": version, "sha256": sha256})[1:]

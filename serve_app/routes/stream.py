@@ -207,7 +207,7 @@ class StreamRoute:
             check_alias(follows)
             if not isinstance(version_of(query.get("version", "1")), int):
                 raise InvalidInput(f"version={query['version'][:64]!r} beside follow, expected a number")
-        version, policy = await self._dependencies.models.find(
+        policy = await self._dependencies.models.find(
             model, follows or query.get("version", CHAMPION), scope["headers"]
         )
         if follows is not None and "version" in query:
@@ -215,14 +215,13 @@ class StreamRoute:
             number, ref = version_of(query["version"]), policy_ref(model)
             named = self._dependencies.slots.get(ref.league, follows)
             members = () if named is None else named.members
-            version = next((member for member in members if member.number == number), version)
-            policy = version.policy(ref.policy)
-        headers = {b"x-league-version": str(version.number), b"x-league-sha256": version.sha256, REPLICA: self._replica}
+            policy = next((member.policy(ref.policy) for member in members if member.number == number), policy)
+        headers = {b"x-league-version": str(policy.number), b"x-league-sha256": policy.sha256, REPLICA: self._replica}
         can_wait = STREAM_PROTOCOL in scope.get("extensions", {})
         stream = StreamSession(
             self._dependencies,
             model,
-            (version, policy),
+            policy,
             follows,
             scope["headers"],
             scope.get(KEY),

@@ -26,7 +26,7 @@ from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.live_versions import version_cache
-from serve_app.live_versions.version_cache import ActionSelections
+from serve_app.live_versions.policies import ActionSelections
 from tests.support.clients.actions import BOARD, INVALID, act, b64, board_arrays, boards, inference, rejected
 from tests.support.leagues.protocol_leagues import DTYPES, FRAME, every_kind
 from tests.support.leagues.served_leagues import BOARD as SPACES

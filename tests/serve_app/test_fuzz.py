@@ -26,8 +26,8 @@ from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import inputs
 from serve_app.inference.stream_codec import FRAMING, REQUEST
-from serve_app.inference_protocol.tensors import signature_of
-from serve_app.live_versions.version_cache import ActionSelections, LoadedPolicy, load
+from serve_app.live_versions.policies import ActionSelections, LoadedPolicy
+from serve_app.live_versions.version_cache import load
 from serve_app.openapi.document import document
 from tests.support.examples import examples
 from tests.support.generated_requests import OPERATIONS, draw_request
@@ -117,7 +117,7 @@ def damaged(draw: st.DrawFn, whole: bytes) -> bytes:
 
 def binary_inference(policy: LoadedPolicy, rows: int, data: st.DataObject) -> tuple[bytes, int]:
     """A body, and the length of its JSON header."""
-    ports, parts, listed = signature_of(policy.manifest).inputs, [], []
+    ports, parts, listed = policy.inputs, [], []
     for name, array in zeros(policy, rows).items():
         document = {"name": name, "datatype": ports[name].datatype, "shape": list(array.shape)}
         if data.draw(st.booleans()):

@@ -35,7 +35,7 @@ from league.registry.storage.manifest import MANIFEST, Manifest
 from league.registry.storage.tables import VersionTable
 from serve_app.inference.stream_codec import FRAMING, REQUEST
 from serve_app.live_versions import version_cache
-from serve_app.live_versions.version_cache import ActionSelections
+from serve_app.live_versions.policies import ActionSelections
 from tests.support.clients.actions import BOARD
 from tests.support.leagues.served_leagues import publish
 from tests.support.policies.graphs import masked_mlp

@@ -571,8 +571,8 @@ def address(ray_server: RayServer) -> Address:
 @pytest.mark.e2e
 def test_each_form_of_the_client_is_answered(address: Address, served: Registry) -> None:
     for model in ("board", "pistons", "chess", "vector", "choice"):
-        policy, signature = policy_of(served.storage, model)
-        arrays = observations(signature, 4)
+        policy, ports = policy_of(served.storage, model)
+        arrays = observations(ports, 4)
         for form in FORMS:
             with Triton(form, address) as triton:
                 assert triton.call("is_server_live"), form

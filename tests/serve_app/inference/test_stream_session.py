@@ -30,8 +30,17 @@ from serve_app.access.api_keys import TokenBucket
 from serve_app.access.load_shedding import Backlog
 from serve_app.inference.action_request import Arrays
 from serve_app.inference.stream_batches import StreamBatches
-from serve_app.inference.stream_codec import HAS_RESETS, REQUEST, RESPONSE, BinaryCodec, encode_request, parse_request
-from serve_app.live_versions.version_cache import ActionSelections, LoadedPolicy, load
+from serve_app.inference.stream_codec import (
+    HAS_RESETS,
+    REQUEST,
+    RESPONSE,
+    encode_request,
+    parse_request,
+    read_tensors,
+    write_actions,
+)
+from serve_app.live_versions.policies import ActionSelections, LoadedPolicy
+from serve_app.live_versions.version_cache import load
 from tests.support.clients.actions import BOARD, act, board_arrays, boards
 from tests.support.clients.streams import answer_to, open_stream, send
 from tests.support.examples import examples
@@ -457,8 +466,7 @@ def request_data(draw: st.DrawFn) -> dict[str, Any]:
 @examples(50)
 @given(data=request_data(), has_resets=st.booleans())
 def test_requests_survive_encoding(policies: dict[str, LoadedPolicy], data: dict[str, Any], has_resets: bool) -> None:
-    codec = BinaryCodec(policies["kinds"])
-    names = [name for name, *_ in policies["kinds"].reader.leaves]
+    names = [port.name for port in policies["kinds"].observed]
     assert names == [tensor.name for tensor in policies["kinds"].manifest.inputs]
     by_dtype = dict(zip(DTYPES, data["tensors"], strict=True))
     tensors = [by_dtype[name.removeprefix("observation.")] for name in names]
@@ -468,7 +476,7 @@ def test_requests_survive_encoding(policies: dict[str, LoadedPolicy], data: dict
     read = parse_request(message, MAX_ROWS)
     assert {name: getattr(read, name) for name in data.keys() - {"tensors"}}.items() <= data.items()
     assert (read.resets is not None) == has_resets
-    decoded = codec.read(read)
+    decoded = read_tensors(policies["kinds"], read)
     assert list(decoded) == names
     for name, tensor in zip(names, tensors, strict=True):
         np.testing.assert_array_equal(decoded[name], tensor)
@@ -485,7 +493,7 @@ def test_resets_are_parsed(policies: dict[str, LoadedPolicy], resets: list[bool]
     read = parse_request(message, MAX_ROWS)
     assert read.resets is not None
     assert read.resets.tolist() == resets
-    np.testing.assert_array_equal(BinaryCodec(policies["memory"]).read(read)["observation"], observation)
+    np.testing.assert_array_equal(read_tensors(policies["memory"], read)["observation"], observation)
 
 
 @examples(50)
@@ -496,7 +504,8 @@ def test_replies_contain_the_actions(
     for league, dtype, shape in (("board", "<i8", (rows,)), ("vector", "<f4", (rows, 2))):
         numbers = {"allow_nan": False} if dtype == "<f4" else {}
         actions = data.draw(any_array(np.dtype(dtype), shape, elements=from_dtype(np.dtype(dtype), **numbers)))
-        reply = BinaryCodec(policies[league]).write(actions, version)
+        policies[league].number = version
+        reply = write_actions(policies[league], actions)
         assert RESPONSE.unpack_from(reply) == (1, 0, 0, rows, version, 0)
         np.testing.assert_array_equal(np.frombuffer(reply, dtype, offset=16).reshape(shape), actions)
 
@@ -508,11 +517,10 @@ def test_a_header_has_the_documented_layout() -> None:
 
 def test_bytes_of_a_boolean_are_0_and_1(policies: dict[str, LoadedPolicy]) -> None:
     planes, mask = np.zeros((1, 8, 8, 111), np.uint8), np.ones((1, 4672), np.int8)
-    codec = BinaryCodec(policies["chess"])
-    codec.read(parse_request(encode_request([planes, mask], 1), MAX_ROWS))
+    read_tensors(policies["chess"], parse_request(encode_request([planes, mask], 1), MAX_ROWS))
     planes[0, 3, 3, 3] = 2
     with pytest.raises(ObservationError, match="other than 0 and 1"):
-        codec.read(parse_request(encode_request([planes, mask], 1), MAX_ROWS))
+        read_tensors(policies["chess"], parse_request(encode_request([planes, mask], 1), MAX_ROWS))
 
 
 @pytest.fixture
@@ -521,7 +529,7 @@ def policy(storage: Storage) -> Iterator[LoadedPolicy]:
     registry = Registry.open(storage)
     policy = load(registry, "board", 1, 0.0, ActionSelections()).policy("shared")
     policy.inline_rows = 64  # however fast the machine is
-    policy.inline_policy = policy.policy.within(60.0)
+    policy.inline_graph = policy.graph.within(60.0)
     yield policy
     registry.close()
 
@@ -530,13 +538,13 @@ def policy(storage: Storage) -> Iterator[LoadedPolicy]:
 def batches(policy: LoadedPolicy, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The number of rows of each of its runs."""
     rows = list[int]()
-    act = policy.inline_policy.act
+    act = policy.inline_graph.act
 
     def counted(observations: Arrays, **options: Any) -> Actions:
         rows.append(len(observations["action_mask"]))
         return act(observations, **options)
 
-    monkeypatch.setattr(policy.inline_policy, "act", counted)
+    monkeypatch.setattr(policy.inline_graph, "act", counted)
     return rows
 
 
@@ -564,7 +572,7 @@ async def together(policy: LoadedPolicy, messages: list[Arrays], explore: bool =
 
 def test_messages_of_one_turn_are_one_batch(policy: LoadedPolicy, batches: list[int]) -> None:
     messages = [board_arrays(boards(8)[:rows]) for rows in (1, 3, 8, 1)]
-    expected = [policy.inline_policy.act(message).actions.tolist() for message in messages]
+    expected = [policy.inline_graph.act(message).actions.tolist() for message in messages]
     batches.clear()
     assert asyncio.run(together(policy, messages)) == expected
     assert batches == [13]
@@ -588,7 +596,7 @@ def test_sampled_actions_are_drawn_for_each_row(policy: LoadedPolicy, batches: l
 
 def test_an_error_is_that_of_its_message(policy: LoadedPolicy, batches: list[int]) -> None:
     one = board_arrays([BOARD])
-    expected = policy.inline_policy.act(one).actions.tolist()
+    expected = policy.inline_graph.act(one).actions.tolist()
     wrong = one | {"observation": one["observation"].astype(np.float32)}
     first, second, third = asyncio.run(together(policy, [one, wrong, one]))
     assert first == third == expected
@@ -600,7 +608,7 @@ def test_messages_of_a_slow_policy_run_in_threads(policy: LoadedPolicy, monkeypa
         monkeypatch.undo()
         raise GraphTimeout("too slow")
 
-    monkeypatch.setattr(policy.inline_policy, "act", run_out_of_time)
+    monkeypatch.setattr(policy.inline_graph, "act", run_out_of_time)
     assert asyncio.run(together(policy, [board_arrays([BOARD])] * 100)) == ["awaits a thread"] * 100, (
         "of later batches, too"
     )

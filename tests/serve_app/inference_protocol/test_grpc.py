@@ -74,12 +74,12 @@ def vector(**changes: Any) -> messages.ModelInferRequest:
 
 
 def test_tensors_in_the_field_of_their_datatype(call: Call, leagues: Storage) -> None:
-    policy, signature = policy_of(leagues, "kinds")
-    arrays = observations(signature, 2)
+    policy, ports = policy_of(leagues, "kinds")
+    arrays = observations(ports, 2)
     # FP16 has no field, and raw contents must be given for all inputs or for none.
     tensors = [
         Input(name=name, datatype=datatype, shape=arrays[name].shape, contents=contents)
-        for name, port in signature.inputs.items()
+        for name, port in ports.items()
         if (datatype := port.datatype) != "FP16"
         for contents in [{CONTENTS[datatype]: arrays[name].ravel().tolist()}]
     ]

@@ -60,9 +60,9 @@ def error_of(triton: Triton, *arguments: Any, **options: Any) -> str:
 def test_each_tensor_type(clients: dict[str, Triton], leagues: Storage) -> None:
     """Over HTTP in both encodings, over gRPC, and one of them by the asynchronous clients."""
     for model in MODELS:
-        policy, signature = policy_of(leagues, model)
+        policy, ports = policy_of(leagues, model)
         for rows in (1, 3):
-            arrays = observations(signature, rows)
+            arrays = observations(ports, rows)
             expected = policy.distribution(arrays)
             assert expected.dist_inputs is not None
             for form, binary in (
@@ -80,8 +80,8 @@ def test_each_tensor_type(clients: dict[str, Triton], leagues: Storage) -> None:
 
 def test_a_version_by_number_or_alias(triton: Triton, leagues: Storage) -> None:
     for version, number in (("", 1), ("1", 1), ("2", 2), ("3", 3), ("champion", 1)):
-        policy, signature = policy_of(leagues, "board", number)
-        arrays = observations(signature, 8)
+        policy, ports = policy_of(leagues, "board", number)
+        arrays = observations(ports, 8)
         result = triton.infer("board", arrays, version=version, request_id="tick 7")
         assert_same(result.as_numpy("action"), policy.act(arrays).actions)
         assert all(array is not None for array in outputs_of(result, OUTPUTS).values()), "by default all"
@@ -90,10 +90,10 @@ def test_a_version_by_number_or_alias(triton: Triton, leagues: Storage) -> None:
 
 
 def test_outputs_can_be_selected(triton: Triton, leagues: Storage) -> None:
-    _, signature = policy_of(leagues, "board")
+    _, ports = policy_of(leagues, "board")
     for names in (["action"], ["action_dist_inputs"], ["action_dist_inputs", "action"]):
         for binary in (True, False):
-            result = triton.infer("board", observations(signature, 2), outputs=names, binary=binary)
+            result = triton.infer("board", observations(ports, 2), outputs=names, binary=binary)
             arrays = outputs_of(result, OUTPUTS)
             assert [name for name in OUTPUTS if arrays[name] is not None] == sorted(names)
             response = result.get_response() if triton.is_http else result.get_response(as_json=True)
@@ -156,10 +156,10 @@ def test_statistics_count_rows_and_runs(triton: Triton, leagues: Storage) -> Non
             for number in (*numbers, *(inferred[outcome].get("count", 0) for outcome in ("success", "fail")))
         ]
 
-    _, signature = policy_of(leagues, "vector")
+    _, ports = policy_of(leagues, "vector")
     before = count()
     for rows in (1, 5):
-        triton.infer("vector", observations(signature, rows))
+        triton.infer("vector", observations(ports, rows))
     error_of(triton, "vector", {"observation": np.zeros((1, 3), np.float32)})
     assert [after - earlier for after, earlier in zip(count(), before, strict=True)] == [6, 2, 2, 1]
 
@@ -219,9 +219,9 @@ def test_unsupported_features_are_rejected(triton: Triton, leagues: Storage) -> 
     with pytest.raises(InferenceServerException, match="shared_memory_region, which this server does not support"):
         triton.call("infer", "vector", [tensor])
     classes = triton.module.InferRequestedOutput("action", class_count=2)
-    _, signature = policy_of(leagues, "vector")
+    _, ports = policy_of(leagues, "vector")
     tensor = triton.module.InferInput("observation", [1, 2], "FP32")
-    tensor.set_data_from_numpy(observations(signature, 1)["observation"])
+    tensor.set_data_from_numpy(observations(ports, 1)["observation"])
     with pytest.raises(InferenceServerException, match="classification, which this server does not support"):
         triton.call("infer", "vector", [tensor], outputs=[classes])
 
@@ -315,8 +315,8 @@ def test_a_remote_model_acts_as_the_version(
 ) -> None:
     monkeypatch.setattr("league.policies.open_inference.MAX_ROWS", 8)  # the server's limit in these tests
     for model, rows in (("board", 5), ("vector", 17), ("nested", 5), ("choice", 5), ("pistons", 5)):
-        policy, signature = policy_of(leagues, model)
-        arrays = observations(signature, rows)
+        policy, ports = policy_of(leagues, model)
+        arrays = observations(ports, rows)
         for _, acting in contestant(str(remote(replica, model)), None, interface_of(leagues, model)).values():
             np.testing.assert_array_equal(acting.act(arrays).actions, policy.act(arrays).actions)
 

@@ -26,9 +26,9 @@ from policy_league_client.requests import ActionRequest
 from policy_league_client.responses import parse_model
 from policy_league_client.stream_protocol import StreamProtocol
 from serve_app.app import Replica
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.shadow import MAX_ROWS, MirroredRequest, Shadow, compare
 from serve_app.live_versions.traffic_split import key_position
-from serve_app.live_versions.version_cache import LoadedVersion
 from tests.support.clients.actions import (
     BOARD,
     act,
@@ -415,7 +415,7 @@ def shadow_policy(server: Replica, version: int) -> OnnxPolicy:
     """The policy of a version of `board` with which a shadow runs."""
     candidate = server.versions.cached("board", version)
     assert candidate is not None
-    policy = candidate.policies["shared"].shadow_policy
+    policy = candidate.policies["shared"].shadow_graph
     assert isinstance(policy, OnnxPolicy)
     return policy
 
@@ -424,7 +424,7 @@ def test_a_run_that_does_not_end_is_counted(
     shadowed: TestClient, server: Replica, registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those that wait for the same version are counted without being run."""
-    monkeypatch.setattr("serve_app.live_versions.version_cache.SHADOW_TIMEOUT", 0.1)
+    monkeypatch.setattr("serve_app.live_versions.policies.SHADOW_TIMEOUT", 0.1)
     endless = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
     set_shadow(registry, version=endless)
     for _ in range(20):
@@ -439,7 +439,7 @@ def test_a_run_that_does_not_end_is_counted(
 def test_runs_end_when_the_shadow_is_switched_off(
     shadowed: TestClient, server: Replica, registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("serve_app.live_versions.version_cache.SHADOW_TIMEOUT", 600.0)
+    monkeypatch.setattr("serve_app.live_versions.policies.SHADOW_TIMEOUT", 600.0)
     endless = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
     set_shadow(registry, version=endless)
     owner = shadow_policy(server, endless)._owner
@@ -455,7 +455,7 @@ def test_runs_end_when_the_shadow_is_switched_off(
     wait_for(registry, lambda one: one.failed == 1, candidate=endless)
 
 
-async def replica_with_shadow(registry: Registry) -> tuple[Replica, LoadedVersion]:
+async def replica_with_shadow(registry: Registry) -> tuple[Replica, LoadedPolicy]:
     """A replica whose queue of mirrored requests holds four, and its champion."""
     server = Replica(registry, QUICK.model_copy(update={"shadow_waiting": 4}), "replica-1")
     server.traffic.update({"board": registry.traffic.set("board", shadow=Portion(2, 1), actor="test", reason="test")})
@@ -463,7 +463,7 @@ async def replica_with_shadow(registry: Registry) -> tuple[Replica, LoadedVersio
     await server.alias_slots.settle(30)
     champion = server.alias_slots.champion("board")
     assert champion is not None
-    return server, champion
+    return server, champion.policy(None)
 
 
 async def wait_for_requests(shadow: Shadow, number: int) -> None:
@@ -477,7 +477,7 @@ async def test_requests_beyond_the_limits_of_the_queue_are_dropped(
     registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server, champion = await replica_with_shadow(registry)
-    mirror, observations = server.shadow.mirror_for("board", champion), board_arrays([BOARD])
+    mirror, observations = server.shadow.mirror_for(champion), board_arrays([BOARD])
     assert mirror is not None
     for _ in range(10):
         mirror(observations, None, np.array([0]))
@@ -497,7 +497,7 @@ async def test_a_share_of_one_half_mirrors_about_half(registry: Registry) -> Non
     server, champion = await replica_with_shadow(registry)
     half = registry.traffic.set("board", shadow=Portion(2, 0.5), actor="test", reason="test")
     server.traffic.update({"board": half})
-    assert 350 < sum(server.shadow.mirror_for("board", champion) is not None for _ in range(1000)) < 650
+    assert 350 < sum(server.shadow.mirror_for(champion) is not None for _ in range(1000)) < 650
 
 
 @pytest.mark.anyio
@@ -512,7 +512,7 @@ async def test_the_number_of_rows_computed_at_once_is_limited(registry: Registry
             "observation": random.integers(0, 2, (rows, 6, 7, 2), dtype=np.int8),
             "action_mask": np.ones((rows, 7), np.int8),
         }
-        return MirroredRequest(candidate, champion, None, batch, champion.policy(None).policy.act(batch).actions)
+        return MirroredRequest(candidate, champion, batch, champion.graph.act(batch).actions)
 
     requests = [request(rows) for rows in (1, 200, 56, 1, 300, 5)]
     outcomes, seconds = compare(requests)

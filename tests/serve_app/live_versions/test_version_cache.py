@@ -16,7 +16,8 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import Member, Mixture
 from league.registry.storage.rows import VersionState
 from serve_app.live_versions.alias_slots import Alias, AliasSlots
-from serve_app.live_versions.version_cache import MAX_REQUESTED, ActionSelections, LoadedVersion, VersionCache, load
+from serve_app.live_versions.policies import ActionSelections, LoadedVersion
+from serve_app.live_versions.version_cache import MAX_REQUESTED, VersionCache, load
 from serve_app.runtime.ray_serve import logger
 from tests.support.leagues.served_leagues import publish
 from tests.support.policies.graphs import masked_mlp

@@ -135,7 +135,7 @@ async def test_the_number_of_series_is_limited(registry: Registry) -> None:
     version = server.alias_slots.champion("board")
     assert version is not None
     for api in range(MAX_SERIES + 5):
-        server.metrics.count_request(str(api), "board", version, 1, 1)
+        server.metrics.count_request(str(api), version.policy(None), 1, 1)
     assert len(server.metrics.report()["league_request_seconds"]) == MAX_SERIES
 
 

@@ -1,4 +1,4 @@
-"""Random observations of any league, from its signature."""
+"""Random observations of any league, from the inputs of its policy."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,27 +7,27 @@ from league.policies.onnx import OnnxPolicy
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.spaces import ACTION_MASK, Box, Discrete
-from serve_app.inference_protocol.tensors import Signature, TensorSpec, signature_of
+from serve_app.live_versions.policies import Port, Ports, input_ports
 
 
-def policy_of(storage: Storage, model: str, version: int = 1) -> tuple[OnnxPolicy, Signature]:
-    """The policy that answers for a model, and its signature."""
+def policy_of(storage: Storage, model: str, version: int = 1) -> tuple[OnnxPolicy, Ports]:
+    """The policy that answers for a model, and its inputs."""
     league, _, name = model.partition(".")
     registry = Registry.open(storage)
     manifest = registry.versions.get(league, version).manifest
     policy = manifest.policies[name or next(iter(manifest.policies))]
     loaded = OnnxPolicy(registry.artifacts.read(manifest, policy.file), policy)
     registry.close()
-    return loaded, signature_of(policy)
+    return loaded, input_ports(policy)
 
 
-def observations(signature: Signature, rows: int, seed: int = 0) -> dict[str, NDArray]:
+def observations(ports: Ports, rows: int, seed: int = 0) -> dict[str, NDArray]:
     """A batch without recurrent state."""
     random = np.random.default_rng(seed)
-    return {name: _draw(port, rows, random) for name, port in signature.inputs.items() if not port.is_state}
+    return {name: _draw(port, rows, random) for name, port in ports.items() if not port.is_state}
 
 
-def _draw(port: TensorSpec, rows: int, random: np.random.Generator) -> NDArray:
+def _draw(port: Port, rows: int, random: np.random.Generator) -> NDArray:
     leaf = port.leaf
     shape, dtype = (rows, *leaf.shape), np.dtype(leaf.dtype)
     if isinstance(leaf, Discrete):
