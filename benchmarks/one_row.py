@@ -1,38 +1,41 @@
 """What does a request with one row cost in each format? Processor time of the server per answered request.
 
 Our handler on uvicorn and our service on grpc.aio, without Ray and HAProxy, and the 2×256 network for connect four.
-Formats alternate within a round, ratios are computed within a round, and the medians over the rounds are reported. The
-peer of the formats over HTTP is JSON; that of gRPC is a call of grpc.aio that is answered with an empty message.
+Formats alternate within a round, ratios are computed within a round, and the medians over the rounds are reported.
+Peers of JSON read the same body, check nothing, run the same graph and answer with the action only: a protocol of
+asyncio with orjson, the leanest server in Python, and an ASGI application on uvicorn. The peer of the other formats
+over HTTP is JSON; that of gRPC is a call of grpc.aio that is answered with an empty message.
 """
 
 import asyncio
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from statistics import median
 
 import grpc
 import numpy as np
 import psutil
 
-from benchmarks.harness import ROOT, Quick, Target
+from benchmarks.harness import Quick, Target
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES, published
 from benchmarks.load import http, websocket
 from benchmarks.load.elsewhere import run_elsewhere
-from benchmarks.peers.bare_servers import INFER
-from league.settings import Storage
+from benchmarks.peers.bare_servers import INFER, started
 from serve_app.inference.stream_codec import encode_request
 from serve_app.inference_protocol import open_inference_pb2 as messages
-from serve_app.runtime import haproxy
-from tests.support.waiting import until
 
 CONNECTIONS = 32
 JSON, EMPTY = "JSON", "grpc.aio, empty"
-PEERS = {"/v2, binary": (JSON, 0.9), "stream, binary": (JSON, 0.5), "gRPC": (EMPTY, 1.4)}
-"""Format → its peer, and the largest ratio to it."""
+PROTOCOL, ASGI = "JSON, a protocol on uvloop", "JSON, ASGI without a framework"
+PEERS = (
+    (JSON, PROTOCOL, 2.0, 0.7),
+    (JSON, ASGI, None, None),
+    ("/v2, binary", JSON, 0.9, 0.9),
+    ("stream, binary", JSON, 0.5, 0.5),
+    ("gRPC", EMPTY, 1.4, 1.4),
+)
+"""Format, its peer, and the largest ratios to it with one connection and with many."""
 ARRAYS = {"observation": PLANES[None], "action_mask": np.ones((1, 7), np.int8)}
 CALL = messages.ModelInferRequest(
     model_name=LEAGUE,
@@ -43,7 +46,6 @@ CALL = messages.ModelInferRequest(
     outputs=[messages.ModelInferRequest.InferRequestedOutputTensor(name="action")],
     raw_input_contents=[array.tobytes() for array in ARRAYS.values()],
 ).SerializeToString()
-START_TIMEOUT = 180.0
 
 Ask = Callable[[int, int, float], float]
 """(port, connections, seconds) → answered requests. Fails if one is not answered."""
@@ -53,9 +55,8 @@ def main(quick: Quick = False, rounds: int = 7, seconds: float = 3.0) -> Iterato
     """Measure all formats with one connection and with many."""
     rounds, seconds = (1, 1.0) if quick else (rounds, seconds)
     with published() as registry, ExitStack() as stack:
-        servers = {
-            kind: stack.enter_context(_server(kind, registry.storage)) for kind in ("handler", "grpc", "empty_grpc")
-        }
+        kinds = {kind for kind, _ in FORMATS.values()}
+        servers = {kind: stack.enter_context(started(kind, registry.storage.home)) for kind in kinds}
         for connections in (1, CONNECTIONS):
             costs: dict[str, list[float]] = {name: [] for name in FORMATS}
             for _ in range(rounds):
@@ -63,8 +64,9 @@ def main(quick: Quick = False, rounds: int = 7, seconds: float = 3.0) -> Iterato
                     costs[name].append(_cost(*servers[kind], ask, connections, seconds))
             for name, of_rounds in costs.items():
                 yield Target(f"{name}, connections: {connections}", round(median(of_rounds), 1), "µs")
-            for name, (peer, most) in PEERS.items():
+            for name, peer, *limits in PEERS:
                 ratio = median(one / other for one, other in zip(costs[name], costs[peer], strict=True))
+                most = limits[connections > 1]
                 yield Target(f"{name}, connections: {connections}", ratio, "×", at_most=most, peer=peer)
 
 
@@ -114,27 +116,14 @@ async def _calls(port: int, connections: int, seconds: float) -> int:
     return answered
 
 
+_over_json = _over_http(ACTION, BODY, dict(http.JSON))
 FORMATS: dict[str, tuple[str, Ask]] = {
-    JSON: ("handler", _over_http(ACTION, BODY, dict(http.JSON))),
+    JSON: ("handler", _over_json),
+    PROTOCOL: ("protocol", _over_json),
+    ASGI: ("asgi", _over_json),
     "/v2, binary": ("handler", _over_http(f"/v2/models/{LEAGUE}/infer", *http.binary(ARRAYS))),
     "stream, binary": ("handler", _over_stream),
     "gRPC": ("grpc", _over_grpc),
     EMPTY: ("empty_grpc", _over_grpc),
 }
 """Format → the kind of server, and how it is asked."""
-
-
-@contextmanager
-def _server(kind: str, storage: Storage) -> Iterator[tuple[psutil.Process, int]]:
-    """The process and the port of one of `bare_servers`."""
-    (port,) = haproxy.free_ports(1, "127.0.0.1")
-    command = [sys.executable, "-m", "benchmarks.peers.bare_servers", kind, str(storage.home), str(port)]
-    with subprocess.Popen(
-        command, cwd=ROOT, stdin=subprocess.PIPE, env=os.environ | {"OMP_NUM_THREADS": "1"}
-    ) as server:
-        assert server.stdin is not None
-        try:
-            until(lambda: not haproxy.is_free("127.0.0.1", port), START_TIMEOUT)
-            yield psutil.Process(server.pid), port
-        finally:
-            server.stdin.close()

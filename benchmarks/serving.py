@@ -1,16 +1,20 @@
 """How fast is the action endpoint, compared with other policy servers and with the software it is built on?
 
 All have a 2×256 network for connect four. Ours parses the board, checks board and mask, and answers with the legal
-action, the version and its digest. Peers: a Serve application with the same settings that reads the same body and
-answers with a constant; the same handler and model on uvicorn alone; FastAPI with torch on uvicorn; RLlib's example of
-serving a policy, which reads a flat board and answers with the arg max. Servers run one at a time, in rounds; ratios
-are computed within a round, and the medians over the rounds are reported. One replica each, unless stated otherwise. By
-default Serve sends 5 concurrent requests to a replica and backs off beyond that: RLlib's example is measured with 5
-connections, too, and its better rate counts. Processor time per answered request is that of all processes of a server;
-it says nothing about waiting, but hardly depends on what else runs on the machine.
+action, the version and its digest. Ratios are computed within a round, and the medians over the rounds are reported.
 
---peers compares with LitServe, MLServer and BentoML instead, one worker each, next to FastAPI. They run our graph with
-ONNX Runtime, answer with the action only, and are installed into a cache folder.
+costs   Processor time of all processes of a server per answered request, which hardly depends on what else runs on the
+        machine: `league serve` with two replicas, and FastAPI with ONNX Runtime on uvicorn. All servers run at the same
+        time and are loaded in turn, with one connection, with 32, and with so many that each waits for the others.
+        `one_row` compares the handler alone with the leanest server in Python.
+rates   Answered requests per second of one replica. Peers: FastAPI with torch on uvicorn; a Serve application with the
+        same settings that reads the same body and answers with a constant; RLlib's example of serving a policy, which
+        reads a flat board and answers with the arg max. By default Serve sends 5 concurrent requests to a replica and
+        backs off beyond that: RLlib's example is measured with 5 connections, too, and its better rate counts. Servers
+        run one at a time.
+
+--peers compares rates with LitServe, MLServer and BentoML instead, one worker each, next to FastAPI. They run our graph
+with ONNX Runtime, answer with the action only, and are installed into a cache folder.
 """
 
 import json
@@ -18,8 +22,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from math import nan
@@ -32,9 +36,10 @@ import psutil
 import typer
 import yaml
 
-from benchmarks.harness import ROOT, Quick, Target
+from benchmarks.harness import ROOT, Parts, Quick, Target, chosen
 from benchmarks.leagues.served_league import ACTION, BODY, LEAGUE, PLANES, published
-from benchmarks.load.http import measure
+from benchmarks.load.http import Load, measure
+from benchmarks.peers.bare_servers import started
 from benchmarks.peers.frameworks import CACHE, FRAMEWORKS, Framework
 from benchmarks.peers.rllib_server import save_module
 from league.registry.registry import Registry
@@ -44,8 +49,15 @@ from serve_app.runtime.launch import DEPLOY_YAML, running
 
 CONNECTIONS = 32
 START_TIMEOUT = 180.0
+CROWDS = (256, 1024)
+"""Connections of which none may be refused."""
+NODE, HANDLER, FASTAPI = "league serve", "the handler on uvicorn", "FastAPI and ONNX Runtime on uvicorn"
+COSTS = ((NODE, CONNECTIONS), (FASTAPI, CONNECTIONS), *((NODE, crowd) for crowd in CROWDS), (NODE, 1), (HANDLER, 1))
+"""Servers and the numbers of connections with which their costs are measured."""
+CHEAPER = 0.5
+"""Maximum ratio of the processor time per request to that of FastAPI."""
 AT_LEAST = {
-    "constant": 0.8, "handler": 0.45, "fastapi": 2.0, "short": None, "default": 14.0, "haproxy": 2.8,
+    "constant": 0.8, "fastapi": 2.0, "short": None, "default": 14.0, "haproxy": 2.8,
     "litserve": 3.0, "mlserver": 3.0, "bentoml": 3.0,
 }  # fmt: skip
 """Minimum ratio of our rate to that of each peer."""
@@ -55,94 +67,138 @@ alone.
 """
 FLAT_BODY = json.dumps({"observation": PLANES.flatten().tolist()}).encode()
 
+Start = Callable[[], AbstractContextManager[str]]
+"""Serves while the context is active, and yields the URL that answers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """A server that answers. roots: ids of its processes that this one has started."""
+
+    url: str
+    roots: list[int]
+
+    def load(self, body: bytes, connections: int, seconds: float, warm_up: float) -> Load:
+        """Load the server, and measure the time of all its processes."""
+        return measure(self.url, body, connections=connections, seconds=seconds, warm_up=warm_up, server=self.roots)
+
+
+@contextmanager
+def _server(start: Start) -> Iterator[Server]:
+    before = set(psutil.Process().children())
+    with start() as url:
+        yield Server(url, [process.pid for process in psutil.Process().children() if process not in before])
+
 
 @dataclass
 class ServerUnderTest:
-    """One of the compared servers, and its measurements by round."""
+    """One of the servers whose rates are compared, and its measurements: in each round, connections → load."""
 
     name: str
-    start: Callable[[], AbstractContextManager[str]]
+    start: Start
     body: bytes
     connections: tuple[int, ...] = (CONNECTIONS,)
-    rates: list[dict[int, float]] = field(default_factory=list)
-    latencies: list[float] = field(default_factory=list)
-    costs: list[float] = field(default_factory=list)
-    failed: int = 0
+    rounds: list[dict[int, Load]] = field(default_factory=list)
 
     def measure(self, seconds: float) -> None:
-        """Measure one round with each number of connections, and with one connection for the latency."""
-        with self.start() as url:
-            rates = {}
-            for connections in self.connections:
-                self.failed += measure(url, self.body, connections=connections, seconds=2, warm_up=0).failed
-                before = _processor_seconds()
-                load = measure(url, self.body, connections=connections, seconds=seconds, warm_up=0)
-                spent = sum(after - before.get(pid, after) for pid, after in _processor_seconds().items())
-                rates[connections] = load.rate
-                self.failed += load.failed
-            self.costs.append(1e6 * spent / (load.requests - load.failed))
-            one = measure(url, self.body, connections=1, seconds=seconds, warm_up=0.5)
-        self.rates.append(rates)
-        self.failed += one.failed
-        self.latencies.append(one.p50)
+        """Measure one round."""
+        with _server(self.start) as server:
+            self.rounds.append({number: server.load(self.body, number, seconds, 2.0) for number in self.connections})
 
-    def best(self, number: int) -> float:
-        """The rate in a round with the best number of connections."""
-        return max(self.rates[number].values())
+    def best(self, number: int) -> Load:
+        """The load of a round with the best number of connections."""
+        return max(self.rounds[number].values(), key=lambda load: load.rate)
+
+    @property
+    def failed(self) -> int:
+        """Requests that were not answered, of all rounds."""
+        return sum(load.failed for loads in self.rounds for load in loads.values())
 
     @property
     def summary(self) -> str:
-        rates = ", ".join(
-            f"{median(of_round[count] for of_round in self.rates):,.0f}/s at {count}" for count in self.connections
-        )
-        failed = f", {self.failed} failed" if self.failed else ""
-        cost = f"{median(self.costs):.0f} µs of processor time per request"
-        return f"{rates} connections, {cost}, p50 {median(self.latencies):.2f} ms at 1{failed}"
-
-
-def _processor_seconds() -> dict[int, float]:
-    """Processor time of each process that this one, or one of its own, has started."""
-    seconds = {}
-    for process in psutil.Process().children(recursive=True):
-        with suppress(psutil.NoSuchProcess):
-            times = process.cpu_times()
-            seconds[process.pid] = times.user + times.system
-    return seconds
+        texts = []
+        for number in self.connections:
+            loads = [of_round[number] for of_round in self.rounds]
+            texts.append(f"at {number} connections {_speed(loads)}, {_median(loads, 'cost'):.0f} µs of processor time")
+        return "; ".join(texts) + (f"; {self.failed} failed" if self.failed else "")
 
 
 def main(
+    parts: Parts = None,
     quick: Quick = False,
-    rounds: int = 3,
-    seconds: float = 5.0,
-    peers: Annotated[bool, typer.Option("--peers", help="compare with LitServe, MLServer and BentoML")] = False,
+    peers: Annotated[bool, typer.Option("--peers", help="rates of LitServe, MLServer and BentoML")] = False,
     cache: Annotated[Path, typer.Option(help="where they are installed")] = CACHE,
 ) -> Iterator[Target]:
     """Measure the servers in rounds, and compare ours with the others."""
-    rounds, seconds = (1, 2.0) if quick else (rounds, seconds)
     with published() as registry:
-        scratch = registry.storage.home.parent
-        servers = _frameworks(registry.storage, scratch, cache) if peers else _servers(registry.storage, scratch)
-        for number in range(rounds):
-            for server in servers.values():
-                server.measure(seconds)
-                print(f"after round {number + 1}: {server.name}: {server.summary}", flush=True)
+        storage = registry.storage
+        measurements = {
+            "costs": partial(_costs, storage, quick),
+            "rates": partial(_rates, storage, quick, peers, cache),
+        }
+        for measurement in chosen(parts, measurements).values():
+            yield from measurement()
+
+
+def _costs(storage: Storage, quick: bool) -> Iterator[Target]:
+    rounds, seconds = (1, 1.0) if quick else (7, 3.0)
+    starts: dict[str, Start] = {
+        NODE: lambda: _ours(storage, 2),
+        HANDLER: lambda: _bare("handler", storage),
+        FASTAPI: lambda: _bare("fastapi", storage),
+    }
+    loads: dict[tuple[str, int], list[Load]] = {key: [] for key in COSTS}
+    with ExitStack() as stack:
+        servers = {name: stack.enter_context(_server(start)) for name, start in starts.items()}
+        for _ in range(rounds):
+            for name, connections in COSTS:
+                # Without a warm-up, because none may be refused while the connections are opened either.
+                load = servers[name].load(BODY, connections, seconds, 0.0)
+                loads[name, connections].append(load)
+    for (name, connections), of_rounds in loads.items():
+        failed, requests = sum(load.failed for load in of_rounds), sum(load.requests for load in of_rounds)
+        cost = round(_median(of_rounds, "cost"), 1)
+        yield Target(f"{name}, connections: {connections}", cost, "µs", note=_speed(of_rounds))
+        if connections in CROWDS:
+            yield Target(f"{name}, connections: {connections}, refused", failed, at_most=0, note=f"of {requests:,}")
+        elif connections == 1:
+            yield Target(f"{name}, p50 with one connection", round(_median(of_rounds, "p50"), 2), "ms")
+    pairs = zip(loads[NODE, CONNECTIONS], loads[FASTAPI, CONNECTIONS], strict=True)
+    ratio = median(node.cost / peer.cost for node, peer in pairs)
+    yield Target(f"{NODE}, processor time per request", ratio, "×", at_most=CHEAPER, peer=FASTAPI)
+    slower = median(node.p50 - bare.p50 for node, bare in zip(loads[NODE, 1], loads[HANDLER, 1], strict=True))
+    yield Target("p50 with one connection", round(slower, 2), "ms", at_most=SLOWER_BY, peer="bare uvicorn")
+
+
+def _speed(loads: Sequence[Load]) -> str:
+    rate, p50, p99 = (_median(loads, name) for name in ("rate", "p50", "p99"))
+    return f"{rate:,.0f}/s, p50 {p50:.2f} ms, p99 {p99:.1f} ms"
+
+
+def _median(loads: Sequence[Load], name: str) -> float:
+    return median(getattr(load, name) for load in loads)
+
+
+def _rates(storage: Storage, quick: bool, peers: bool, cache: Path) -> Iterator[Target]:
+    rounds, seconds = (1, 2.0) if quick else (3, 5.0)
+    scratch = storage.home.parent
+    servers = _frameworks(storage, scratch, cache) if peers else _servers(storage, scratch)
+    for number in range(rounds):
+        for server in servers.values():
+            server.measure(seconds)
+            print(f"after round {number + 1}: {server.name}: {server.summary}", flush=True)
     ours = servers["ours"]
     assert not ours.failed, "an action was not answered"
     for key, server in servers.items():
-        rate = round(median(server.best(number) for number in range(rounds)))
+        rate = round(median(server.best(number).rate for number in range(rounds)))
         yield Target(server.name, rate, "/s", note=server.summary)
         if key in AT_LEAST:
             yield _compare(ours, server, AT_LEAST[key])
-    if (handler := servers.get("handler")) is not None:
-        slower = median(ours_p50 - bare for ours_p50, bare in zip(ours.latencies, handler.latencies, strict=True))
-        yield Target("p50 with one connection", round(slower, 2), "ms", at_most=SLOWER_BY, peer="bare uvicorn")
 
 
 def _compare(ours: ServerUnderTest, peer: ServerUnderTest, least: float | None) -> Target:
-    ratio = median(ours.best(number) / (peer.best(number) or nan) for number in range(len(ours.rates)))
-    cheaper = median(theirs / cost for cost, theirs in zip(ours.costs, peer.costs, strict=True))
-    note = f"processor time per request 1/{cheaper:.2f}"
-    return Target("one replica", ratio, "×", at_least=least, peer=peer.name, note=note)
+    ratio = median(ours.best(number).rate / (peer.best(number).rate or nan) for number in range(len(ours.rounds)))
+    return Target("one replica", ratio, "×", at_least=least, peer=peer.name)
 
 
 def _frameworks(storage: Storage, scratch: Path, cache: Path) -> dict[str, ServerUnderTest]:
@@ -160,7 +216,7 @@ def _frameworks(storage: Storage, scratch: Path, cache: Path) -> dict[str, Serve
 def _own_and_fastapi(storage: Storage) -> dict[str, ServerUnderTest]:
     return {
         "ours": ServerUnderTest("ours", lambda: _ours(storage, 1), BODY),
-        "fastapi": ServerUnderTest("FastAPI and torch on uvicorn", lambda: _bare("fastapi", storage), BODY),
+        "fastapi": ServerUnderTest("FastAPI and torch on uvicorn", lambda: _bare("fastapi_torch", storage), BODY),
     }
 
 
@@ -168,12 +224,10 @@ def _servers(storage: Storage, scratch: Path) -> dict[str, ServerUnderTest]:
     checkpoint = scratch / "rllib"
     save_module(checkpoint)
     return _own_and_fastapi(storage) | {
-        "ours, 2": ServerUnderTest("ours, two replicas as in deploy.yaml", lambda: _ours(storage, 2), BODY),
         "constant": ServerUnderTest("a constant on Serve", lambda: _constant(storage, scratch, "build_app"), BODY),
         "short": ServerUnderTest(
             "a constant past Serve's handling", lambda: _constant(storage, scratch, "build_short"), BODY
         ),
-        "handler": ServerUnderTest("the same handler on bare uvicorn", lambda: _bare("handler", storage), BODY),
         "haproxy": ServerUnderTest(
             "RLlib's example, one torch thread, our HAProxy settings", lambda: _tuned(checkpoint), FLAT_BODY
         ),
@@ -213,20 +267,11 @@ def _constant(storage: Storage, scratch: Path, factory: str) -> Iterator[str]:
 
 @contextmanager
 def _bare(kind: str, storage: Storage) -> Iterator[str]:
-    (port,) = haproxy.free_ports(1, "127.0.0.1")
-    command = [sys.executable, "-m", "benchmarks.peers.bare_servers", kind, str(storage.home), str(port)]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, env=environment) as server:
-        url = f"http://127.0.0.1:{port}{ACTION}"
-        assert server.stdin is not None
-        try:
-            _await(url, server)
-            yield url
-        finally:
-            server.stdin.close()
+    with started(kind, storage.home) as (_, port):
+        yield f"http://127.0.0.1:{port}{ACTION}"
 
 
-def _await(url: str, server: "subprocess.Popen[bytes]", body: bytes = BODY) -> None:
+def _await(url: str, server: "subprocess.Popen[bytes]", body: bytes) -> None:
     deadline = time.monotonic() + START_TIMEOUT
     while time.monotonic() < deadline and server.poll() is None:
         try:

@@ -4,9 +4,11 @@ Each request costs it a few microseconds.
 """
 
 import asyncio
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from random import random
 from typing import cast
@@ -14,6 +16,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import orjson
+import psutil
 from numpy.typing import NDArray
 
 from benchmarks.load.elsewhere import run_elsewhere
@@ -22,7 +25,10 @@ from league.policies.open_inference import DATATYPES
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """The results of one run. Times in milliseconds; `failed`: dropped connections and statuses other than 200."""
+    """The results of one run. Times in milliseconds; `failed`: dropped connections and statuses other than 200.
+
+    processor: seconds of processor time of all processes of the server.
+    """
 
     requests: int
     seconds: float
@@ -31,11 +37,17 @@ class Load:
     p50: float
     p99: float
     max: float
+    processor: float
 
     @property
     def rate(self) -> float:
         """Responses with status 200 per second."""
         return (self.requests - self.failed) / self.seconds
+
+    @property
+    def cost(self) -> float:
+        """Microseconds of the server's processor time per response with status 200."""
+        return 1e6 * self.processor / (self.requests - self.failed or math.nan)
 
 
 OnReply = Callable[[int, bytes, float], bool]
@@ -174,7 +186,14 @@ async def drive(
 
 
 async def run(
-    url: str, body: bytes, connections: int, seconds: float, warm_up: float, rate: float, headers: Mapping[str, str]
+    url: str,
+    body: bytes,
+    connections: int,
+    seconds: float,
+    warm_up: float,
+    rate: float,
+    headers: Mapping[str, str],
+    server: Sequence[int],
 ) -> Load:
     """Load `url` for `warm_up + seconds`; the warm-up is not counted."""
     statuses: Counter[str] = Counter()
@@ -189,13 +208,30 @@ async def run(
             latencies.append(replied_at - sent_at)
         return replied_at < stop
 
-    await drive(url, body, connections, on_reply, lambda: time.perf_counter() < stop, rate=rate, headers=headers)
-    times = np.array(latencies or [np.nan]) * 1e3
-    p50, p99 = np.percentile(times, [50, 99])
-    requests = statuses.total()
-    return Load(
-        requests, seconds, requests - statuses["200"], dict(statuses), float(p50), float(p99), float(times.max())
+    processor, _ = await asyncio.gather(
+        _processor(server, start, stop),
+        drive(url, body, connections, on_reply, lambda: time.perf_counter() < stop, rate=rate, headers=headers),
     )
+    times = np.array(latencies or [np.nan]) * 1e3
+    p50, p99 = map(float, np.percentile(times, [50, 99]))
+    requests = statuses.total()
+    return Load(requests, seconds, requests - statuses["200"], dict(statuses), p50, p99, float(times.max()), processor)
+
+
+async def _processor(roots: Sequence[int], start: float, stop: float) -> float:
+    """Seconds of processor time between two times, of these processes and those below them."""
+    readings = []
+    for moment in (start, stop):
+        await asyncio.sleep(moment - time.perf_counter())
+        reading = {}
+        for root in map(psutil.Process, roots):
+            for process in (root, *root.children(recursive=True)):
+                with suppress(psutil.NoSuchProcess):
+                    times = process.cpu_times()
+                    reading[process.pid] = times.user + times.system
+        readings.append(reading)
+    before, after = readings
+    return sum(spent - before.get(process, 0.0) for process, spent in after.items())
 
 
 def measure(
@@ -207,6 +243,9 @@ def measure(
     warm_up: float = 1.0,
     rate: float = 0.0,
     headers: Mapping[str, str] = JSON,
+    server: Sequence[int] = (),
 ) -> Load:
-    """Run the generator in a process of its own."""
-    return run_elsewhere(run, url, body, connections, seconds, warm_up, rate, dict(headers))
+    """Run the generator in a process of its own. server: ids of the processes of which all others of the server are
+    descendants.
+    """
+    return run_elsewhere(run, url, body, connections, seconds, warm_up, rate, dict(headers), server)
