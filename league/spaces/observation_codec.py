@@ -1,6 +1,7 @@
 """Decodes JSON observations and recurrent state to the input arrays of a policy."""
 
 from collections.abc import Iterable, KeysView, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from league.spaces import ACTION_MASK, Leaf, Space, inputs, paths
 from league.spaces.arrays import at_path, check, check_mask
 from league.spaces.binary_leaves import check_decoded_size, decode, is_encoded
 
+BYTES = ("int8", "uint8")
+"""Data types of elements of one byte."""
 EXACT = 2.0**53
 """Up to this number, floats contain all integers."""
 JSON_TYPES = {dict: "an object", list: "a list", str: "a string", bool: "a boolean", int: "a number", float: "a number"}
@@ -51,7 +54,9 @@ class ObservationReader:
                         rows[place] = decode(name, row, leaf)
                     else:
                         reject_strings(row)
-            array = _array(name, rows, leaf)
+            array = _bytes(rows, leaf) if leaf.dtype in BYTES else None
+            if array is None:
+                array = _array(name, rows, leaf)
             if is_mixed and array.dtype.kind == "f" and not (np.abs(array) <= EXACT).all():
                 raise ObservationError(f"{name} is not exact in one array")
             arrays[name] = check(name, array, leaf)
@@ -119,6 +124,24 @@ def _objects(leaf_paths: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], Key
         for depth, key in enumerate(path):
             objects.setdefault(path[:depth], {})[key] = None
     return {path: keys.keys() for path, keys in objects.items()}
+
+
+def _bytes(rows: list[Any], leaf: Leaf) -> NDArray | None:
+    """The array of nested lists of integers of one byte, which takes half the time of NumPy's conversion; None for
+    others, valid or not.
+    """
+    values = rows
+    try:
+        for size in leaf.shape:
+            if set(map(len, values)) != {size}:
+                return None
+            values = list(chain.from_iterable(values))
+        data = bytes(values)
+    except (TypeError, ValueError):
+        return None
+    if leaf.dtype == "int8" and not data.isascii():  # more than 127
+        return None
+    return np.frombuffer(data, leaf.dtype).reshape(len(rows), *leaf.shape)
 
 
 def _array(name: str, rows: Any, leaf: Leaf) -> NDArray:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from league.errors import ObservationError
-from league.spaces import Box, DictSpace, Discrete, MultiBinary, Space
+from league.spaces import Box, DictSpace, Discrete, MultiBinary, Space, observation_codec
 from league.spaces.arrays import tensors
 from league.spaces.observation_codec import ObservationReader, read_state, reject_strings
 
@@ -84,3 +84,30 @@ def test_zeros_are_valid_observations_and_keys_are_counted() -> None:
         zeros = reader.zeros(2)
         assert {array.shape[0] for array in zeros.values()} == {2}
         assert zeros.get("action_mask", np.ones(1)).all()
+
+
+NUMBERS = st.one_of(st.integers(0, 1), st.integers(-300, 300), st.booleans(), st.sampled_from([1.0, 0.5, 2**70, None]))
+
+
+def result(reader: ObservationReader, rows: list[Any]) -> Any:
+    """An array, with its data type, or an error message."""
+    try:
+        array = reader.read(rows)["observation"]
+    except ObservationError as error:
+        return str(error)
+    return array.dtype, array.tolist()
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint8"])
+@pytest.mark.parametrize("shape", [(), (2,), (2, 1)])
+@given(data=st.data())
+def test_numbers_of_one_byte_are_read_like_others(dtype: str, shape: tuple[int, ...], data: st.DataObject) -> None:
+    reader = ObservationReader(Box(dtype=dtype, shape=shape, low=None, high=None))
+    value: st.SearchStrategy[Any] = NUMBERS
+    for size in reversed(shape):
+        value = st.lists(value, min_size=size, max_size=size) | st.lists(NUMBERS, max_size=3)
+    rows = data.draw(st.lists(value, min_size=1, max_size=3))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(observation_codec, "BYTES", ())
+        expected = result(reader, rows)
+    assert result(reader, rows) == expected
