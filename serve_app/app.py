@@ -8,7 +8,6 @@ A request is answered in the process that it reaches first, and bypasses Ray Ser
 (serve_app.runtime.serve_bypass).
 """
 
-import gc
 import sys
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -72,7 +71,7 @@ from serve_app.routes.stream import StreamRoute
 from serve_app.routes.table import OF_REGISTRY, ROUTES
 from serve_app.routes.traffic import TrafficRoutes
 from serve_app.runtime import autoscaling, ray_serve, serve_bypass, uvicorn_http, uvicorn_websocket
-from serve_app.runtime.replica_process import ReplicaProcess, this_process
+from serve_app.runtime.replica_process import ReplicaProcess, collect_rarely, this_process
 from serve_app.settings import ServeSettings
 
 NAMES = {action.API: "act", stream_session.API: "stream", inference.API: "infer"}
@@ -144,7 +143,7 @@ class PolicyServer(ray_serve.AsgiReplica):
         uvicorn_http.install(self._replica.events.end, self._replica.plain_actions)
         uvicorn_websocket.install(self._replica.settings.max_body, self._replica.settings.max_incomplete)
         grpc_handlers.install(self._replica.inference_service)
-        gc.freeze()  # permanent objects: collecting them again and again would stall the event loop
+        collect_rarely()
         return application
 
     def check_health(self) -> None:

@@ -8,6 +8,7 @@ grpc.aio, which answers the same call with an empty message.
 """
 
 import asyncio
+import gc
 import os
 import subprocess
 import sys
@@ -44,13 +45,16 @@ def handler(home: Path) -> tuple[Any, Any]:
     from league.settings import Storage
     from serve_app.app import Replica
     from serve_app.runtime import uvicorn_websocket
+    from serve_app.runtime.replica_process import collect_rarely
     from serve_app.runtime.uvicorn_http import HttpProtocol
     from serve_app.settings import ServeSettings
 
     settings = ServeSettings()
     replica = Replica(Registry.open(Storage.at(home)), settings, "bare")
     uvicorn_websocket.install(settings.max_body, settings.max_incomplete)
-    return replica.application(), partial(HttpProtocol, replica.events.end, replica.plain_actions)
+    application = replica.application()
+    collect_rarely()
+    return application, partial(HttpProtocol, replica.events.end, replica.plain_actions)
 
 
 def fastapi(home: Path) -> tuple[Any, Any]:
@@ -178,11 +182,13 @@ async def serve_grpc(home: Path | None, port: int) -> None:
     from league.settings import Storage
     from serve_app.app import Replica
     from serve_app.inference_protocol import grpc_handlers
+    from serve_app.runtime.replica_process import collect_rarely
     from serve_app.settings import ServeSettings
 
     replica = Replica(Registry.open(Storage.at(home)), ServeSettings(), "bare")
     grpc_handlers.install(replica.inference_service)
     grpc_handlers.add_service(None, server)
+    collect_rarely()
     application = replica.application()
     async with application.router.lifespan_context(application):
         await server.start()
@@ -206,6 +212,7 @@ def started(kind: str, home: Path) -> Iterator[tuple[psutil.Process, int]]:
 
 def main() -> None:
     """Serve."""
+    gc.freeze()  # modules of benchmarks, which a peer would not have
     kind, home, port = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
     if kind in ("grpc", "empty_grpc"):
         uvloop.run(serve_grpc(home if kind == "grpc" else None, port))
