@@ -2,26 +2,23 @@
 
 import asyncio
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, InvalidInput, InvalidState
 from league.policies.draws import probabilities
 from league.policies.policy import Actions
-from league.random.seeds import generator
 from league.search.searched_actions import SearchedActions
 from league.spaces import ACTION_MASK
 from league.spaces.observation_codec import json_type, read_state, reject_strings
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
 from serve_app.codecs.state_tokens import read_state as state_of_tokens
-from serve_app.live_versions.policies import Graph, LoadedPolicy
-from serve_app.live_versions.remote_search import RemoteSearch
+from serve_app.live_versions.policies import LoadedPolicy, Play
 from serve_app.live_versions.resolver import version_of
 
 KEYS = frozenset(
@@ -43,14 +40,7 @@ class DecodedActionRequest:
     arrays."""
     tokens: list[StateToken | None] | None
     """Recurrent state as tokens, one per observation; None at the start of an episode."""
-    explore: bool | None
-    """Whether to sample the actions; None for the league's default."""
-    seed: int | list[int] | None
-    probabilities: bool
-    deadline: float
-    """When a search ends with the best actions so far, a time of `time.monotonic`; infinity for all simulations."""
-    analysis: bool
-    """Whether to return what a search expects."""
+    play: Play
     strings: int
     """Number of strings in the document, including keys, except those in the observations."""
 
@@ -80,9 +70,8 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
         else:
             tokens = _tokens(state, len(observations) if is_batch else None)
             strings += sum(token is not None for token in tokens)
-    return DecodedActionRequest(
-        observations, is_batch, arrays, tokens, explore, seed, probabilities, deadline, analysis, strings
-    )
+    play = Play(explore, seed, "distribution" if probabilities else None, deadline, analysis)
+    return DecodedActionRequest(observations, is_batch, arrays, tokens, play, strings)
 
 
 def reject_unknown_keys(document: dict[str, Any], known: frozenset[str]) -> None:
@@ -192,46 +181,6 @@ def encode_state(state: Arrays, policy: LoadedPolicy) -> list[str]:
     return write_tokens(policy.qualified, policy.number, policy.sha256, state)
 
 
-def is_sampled(explore: bool | None, policy: LoadedPolicy) -> bool:
-    """Whether the actions of a request are sampled. explore: None if the request does not say."""
-    return policy.samples if explore is None else explore
-
-
-async def execute(
-    policy: LoadedPolicy,
-    observations: Arrays,
-    state: Arrays | None,
-    rng: Sequence[np.random.Generator] | None = None,
-    with_distribution: bool = False,
-    deadline: float = math.inf,
-    with_lines: bool = False,
-) -> Actions:
-    """Run the graph, in a thread if the batch is large. rng: explore, with one generator per row.
-
-    deadline, with_lines: of a search.
-    """
-
-    def act(graph: Graph) -> Actions:
-        if isinstance(graph, RemoteSearch):
-            graph = graph.bounded(deadline, with_lines)
-        if with_distribution and rng is None:
-            return graph.distribution(observations, state=state)
-        return graph.act(observations, state=state, explore=rng is not None, rng=rng)
-
-    return await policy.run(act, len(next(iter(observations.values()))))
-
-
-async def execute_request(
-    request: DecodedActionRequest, policy: LoadedPolicy, observations: Arrays, state: Arrays | None
-) -> tuple[Actions, bool]:
-    """Run the graph with the request's seed. Returns the actions, and whether they are greedy."""
-    if request.analysis and policy.search is None:
-        raise InvalidInput("analysis is true, but this version does not search")
-    rng = generators(request.seed, len(request.observations)) if is_sampled(request.explore, policy) else None
-    answer = await execute(policy, observations, state, rng, request.probabilities, request.deadline, request.analysis)
-    return answer, rng is None
-
-
 def build_response(
     request: DecodedActionRequest, answer: Actions, observations: Arrays, policy: LoadedPolicy
 ) -> dict[str, Any]:
@@ -240,25 +189,16 @@ def build_response(
     response: dict[str, Any] = {"actions": actions} if request.is_batch else {"action": actions[0]}
     if isinstance(answer, SearchedActions):
         rows: dict[str, list[Any]] = {"simulations": answer.simulations()}
-        if request.analysis:
+        if request.play.analysis:
             rows["analysis"] = answer.analyses()
         response |= rows if request.is_batch else {name: values[0] for name, values in rows.items()}
-    if request.probabilities:
+    if request.play.values:
         assert answer.dist_inputs is not None
         # An action that is certain has the probability 1 even if it is illegal.
         mask = observations.get(ACTION_MASK) if policy.graph.has_distribution else None
         likely = probabilities(answer.dist_inputs, policy.manifest.action, mask)
         response["probabilities"] = likely if request.is_batch else likely[0]
     return response
-
-
-def generators(seed: int | list[int] | None, rows: int) -> Sequence[np.random.Generator]:
-    """One generator per row, so that an action does not depend on the batch."""
-    if seed is None:
-        return [np.random.default_rng() for _ in range(rows)]
-    if isinstance(seed, list):
-        return [generator(row_seed, 0) for row_seed in seed]
-    return [generator(seed, row) for row in range(rows)]
 
 
 REPLICA = b"x-league-replica"

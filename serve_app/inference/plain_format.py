@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 
 from league.policies.policy import Actions
 from serve_app.inference.action_request import Arrays
-from serve_app.live_versions.policies import LoadedPolicy
+from serve_app.live_versions.policies import LoadedPolicy, Play
 from serve_app.live_versions.traffic_split import Headers
 from serve_app.runtime.uvicorn_http import HttpProtocol
 
@@ -56,11 +56,8 @@ class PlainFormat(Protocol):
     def read(self, policy: LoadedPolicy, contents: Sequence[Any], rows: int) -> Arrays:
         """The inputs of the graph for the contents of several requests. Raises LeagueError."""
 
-    def run(self, policy: LoadedPolicy, arrays: Arrays, contents: Sequence[Any], rows: int) -> Actions:
-        """Run the graph on the event loop. Raises LeagueError."""
-
-    def is_greedy(self, policy: LoadedPolicy) -> bool:
-        """Whether actions are greedy."""
+    def play(self, contents: Sequence[Any]) -> Play:
+        """How the actions of several requests are chosen."""
 
     def write(self, request: PlainRequest, output: Actions, rows: slice) -> tuple[bytes, bytes] | None:
         """The header lines and the body of the response; None if the application answers after all."""

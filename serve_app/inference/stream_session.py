@@ -30,11 +30,7 @@ from serve_app.inference.action_request import (
     build_response,
     decode_state,
     encode_state,
-    execute,
-    execute_request,
-    generators,
     is_plain,
-    is_sampled,
     parse_action_request,
     parse_flag,
     pinned_version,
@@ -44,7 +40,7 @@ from serve_app.inference.action_request import (
 from serve_app.inference.stream_batches import StreamBatches
 from serve_app.inference.stream_codec import parse_request, read_tensors, write_actions
 from serve_app.live_versions.alias_slots import AliasSlots
-from serve_app.live_versions.policies import LoadedPolicy
+from serve_app.live_versions.policies import LoadedPolicy, Play
 from serve_app.live_versions.resolver import ModelResolver, policy_ref
 from serve_app.live_versions.shadow import Shadow
 from serve_app.live_versions.traffic_split import Headers, TrafficSplit, acting
@@ -153,8 +149,8 @@ class StreamSession:
         policy, state = await self._select(request, is_anew, _resets(reset, request))
         plain = is_plain(request, policy, data.count(b'"') - 2 * len(stream_keys))
         observations = await read_observations(request, policy, plain, len(data))
-        answer, is_greedy = await execute_request(request, policy, observations, state)
-        self._mirror(policy, observations, state, answer.actions if is_greedy else None)
+        answer = await policy.act(observations, request.play, state)
+        self._mirror(policy, observations, state, answer, request.play)
         self._store_state(policy, answer, request.is_batch)
         response = build_response(request, answer, observations, policy)
         if return_state and self._state is not None:
@@ -168,13 +164,11 @@ class StreamSession:
         request = parse_request(data, self._dependencies.settings.max_batch)
         policy, state = self._continue(request.rows, request.reset, request.resets)
         observations = read_tensors(policy, request)
-        explore = is_sampled(request.explore, policy)
-        if self._batches is not None and state is None and request.seed is None and not policy.state:
-            answer = await self._batches.act(policy, observations, request.rows, explore)
+        if self._batches is not None and request.play.seed is None and not policy.state:
+            answer = await self._batches.act(policy, observations, request.rows, request.play)
         else:
-            rng = generators(request.seed, request.rows) if explore else None
-            answer = await execute(policy, observations, state, rng)
-        self._mirror(policy, observations, state, None if explore else answer.actions)
+            answer = await policy.act(observations, request.play, state)
+        self._mirror(policy, observations, state, answer, request.play)
         self._store_state(policy, answer, is_batch=request.rows > 1)
         message = StreamMessage(write_actions(policy, answer.actions), False)
         self._count(policy, request.rows, start)
@@ -228,11 +222,11 @@ class StreamSession:
         return version.policy(self._ref.policy)
 
     def _mirror(
-        self, policy: LoadedPolicy, observations: Arrays, state: Arrays | None, actions: NDArray | None
+        self, policy: LoadedPolicy, observations: Arrays, state: Arrays | None, answer: Actions, play: Play
     ) -> None:
         mirror = self._dependencies.shadow.mirror_for(policy)
         if mirror is not None:
-            mirror(observations, state, actions)
+            mirror(observations, state, None if policy.is_sampled(play) else answer.actions)
 
     def _count(self, policy: LoadedPolicy, rows: int, begun: int) -> None:
         self._dependencies.metrics.count_request(API, policy, rows, perf_counter_ns() - begun)

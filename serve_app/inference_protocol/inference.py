@@ -2,7 +2,7 @@
 graph."""
 
 import asyncio
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from time import perf_counter_ns
 from typing import NamedTuple, TypeVar
@@ -16,7 +16,7 @@ from league.refs import CHAMPION
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference_protocol.statistics import Statistics
 from serve_app.inference_protocol.tensors import RequestTensor, read_inputs
-from serve_app.live_versions.policies import Graph, LoadedPolicy
+from serve_app.live_versions.policies import LoadedPolicy, Play
 from serve_app.live_versions.resolver import ModelResolver
 from serve_app.live_versions.shadow import MirrorFunction, Shadow
 from serve_app.live_versions.traffic_split import Headers
@@ -132,16 +132,15 @@ async def _run(
     arrays: dict[str, NDArray], wanted: Sequence[str], policy: LoadedPolicy, mirror: MirrorFunction | None
 ) -> dict[str, NDArray]:
     state = {name: array for name, array in arrays.items() if policy.inputs[name].is_state} or None
-
-    def act(graph: Graph) -> Actions:
-        if DIST_INPUTS in wanted:
-            return graph.outputs(arrays, state=state)
-        return graph.act(arrays, state=state)
-
-    answer = await policy.run(act, len(next(iter(arrays.values()))))
+    answer = await policy.act(arrays, play_for(wanted), state)
     if mirror is not None:
         mirror({port.name: arrays[port.name] for port in policy.observed}, state, answer.actions)
     return {name: output_of(name, answer) for name in wanted}
+
+
+def play_for(outputs: Iterable[str]) -> Play:
+    """How actions are chosen if these outputs are requested: always greedily."""
+    return Play(explore=False, values="outputs" if DIST_INPUTS in outputs else None)
 
 
 def output_of(name: str, answer: Actions) -> NDArray:

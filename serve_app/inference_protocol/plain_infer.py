@@ -5,11 +5,11 @@ shapes, sizes), is parsed and checked once, by the application's own functions, 
 """
 
 from collections.abc import Sequence
+from itertools import chain
 from time import perf_counter_ns
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
-from league.policies.onnx import DIST_INPUTS
 from league.policies.policy import Actions
 from serve_app.inference.action_request import Arrays
 from serve_app.inference.plain_format import PlainRequest, Target, Times
@@ -19,12 +19,13 @@ from serve_app.inference_protocol.inference import (
     Inference,
     InferResponse,
     output_of,
+    play_for,
     wanted_outputs,
 )
 from serve_app.inference_protocol.rest import BINARY, HEADER_LENGTH, JSON, framing
 from serve_app.inference_protocol.rest_codec import MIN_COMPRESSED_BYTES, RestRequest, read_request, write_response
 from serve_app.inference_protocol.tensors import read_inputs
-from serve_app.live_versions.policies import LoadedPolicy
+from serve_app.live_versions.policies import LoadedPolicy, Play
 from serve_app.live_versions.traffic_split import Headers
 
 MAX_HEAD = 1024
@@ -112,15 +113,9 @@ class PlainInfer:
         tensors = map(b"".join, zip(*(content.tensors for content in contents), strict=True))
         return observations_of(policy, tensors, rows)
 
-    def run(self, policy: LoadedPolicy, arrays: Arrays, contents: Sequence[BinaryTensors], _: int) -> Actions:
+    def play(self, contents: Sequence[BinaryTensors]) -> Play:
         """See `PlainFormat`."""
-        if any(DIST_INPUTS in content.layout.outputs for content in contents):
-            return policy.run_inline(lambda graph: graph.outputs(arrays))
-        return policy.run_inline(lambda graph: graph.act(arrays))
-
-    def is_greedy(self, _: LoadedPolicy) -> bool:
-        """See `PlainFormat`."""
-        return True
+        return play_for(chain.from_iterable(content.layout.outputs for content in contents))
 
     def write(self, request: PlainRequest, output: Actions, rows: slice) -> tuple[bytes, bytes] | None:
         """See `PlainFormat`."""

@@ -1,22 +1,24 @@
 """A policy in memory: who it is, what goes in and out of its graph, and how it runs."""
 
 import asyncio
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import InitVar, dataclass, field
 from functools import lru_cache
 from math import prod
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import orjson
 
 from league.conditions import ActionSelection
-from league.errors import GraphTimeout, UnknownPolicy
+from league.errors import GraphTimeout, InvalidInput, UnknownPolicy
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_OUT, OnnxPolicy
 from league.policies.open_inference import DATATYPES
-from league.policies.policy import Actions
+from league.policies.policy import Actions, Arrays
+from league.random.seeds import generator
 from league.registry.storage.manifest import Mixture, PolicyManifest, Tensor
 from league.spaces import ACTION_MASK, Box, Leaf, inputs
 from league.spaces.observation_codec import ObservationReader
@@ -85,6 +87,30 @@ def output_ports(manifest: PolicyManifest) -> Ports:
     }
 
 
+class Play(NamedTuple):
+    """How the actions of a request are chosen, and what is returned with them."""
+
+    explore: bool | None = None
+    """Whether to sample the actions; None for the league's default."""
+    seed: int | list[int] | None = None
+    """Of all rows, or one for each of them."""
+    values: Literal["distribution", "outputs"] | None = None
+    """What `dist_inputs` of the answer are: inputs of the distribution, of a certain one if the graph has none; or the
+    output of the graph."""
+    deadline: float = math.inf
+    """When a search ends with the best actions so far, a time of `time.monotonic`; infinity for all simulations."""
+    analysis: bool = False
+    """Whether to return what a search expects."""
+
+    def generators(self, rows: int) -> Sequence[np.random.Generator]:
+        """One generator per row, so that an action does not depend on the batch."""
+        if self.seed is None:
+            return [np.random.default_rng() for _ in range(rows)]
+        if isinstance(self.seed, list):
+            return [generator(seed, 0) for seed in self.seed]
+        return [generator(self.seed, row) for row in range(rows)]
+
+
 @dataclass(slots=True, eq=False, weakref_slot=True)
 class LoadedPolicy:
     """One policy of a version, ready for inference.
@@ -151,26 +177,48 @@ class LoadedPolicy:
         """Whether actions are sampled if a request does not say, as in the league's matches."""
         return self.graph.has_distribution and self.selections[self.league] == "sampled"
 
-    async def run(self, act: Callable[[Graph], Actions], rows: int) -> Actions:
-        """Call `act` with the graph, in a thread if the batch is large. Raises the errors of `act`."""
-        if rows <= self.inline_rows:
+    def is_sampled(self, play: Play) -> bool:
+        """Whether the actions of a request are sampled."""
+        return self.samples if play.explore is None else play.explore
+
+    async def act(self, arrays: Arrays, play: Play, state: Arrays | None = None) -> Actions:
+        """Choose actions, in a thread if the batch is large.
+
+        arrays: the inputs of the graph, with or without the state. Raises LeagueError.
+        """
+        if play.analysis and self.search is None:
+            raise InvalidInput("analysis is true, but this version does not search")
+        if _rows(arrays) <= self.inline_rows:
             with suppress(GraphTimeout):
-                return self.run_inline(act)
+                return self.act_inline(arrays, play, state)
         async with self._threads:
             threads = None if self.search is None else self.search.threads
-            return await asyncio.get_running_loop().run_in_executor(threads, act, self.graph)
+            return await asyncio.get_running_loop().run_in_executor(threads, self._act, self.graph, arrays, play, state)
 
-    def run_inline(self, act: Callable[[Graph], Actions]) -> Actions:
-        """Call `act` with the graph on the event loop. Raises the errors of `act`."""
+    def act_inline(self, arrays: Arrays, play: Play, state: Arrays | None = None) -> Actions:
+        """Choose actions on the event loop. Raises LeagueError."""
         try:
-            return act(self.inline_graph)
+            return self._act(self.inline_graph, arrays, play, state)
         except GraphTimeout:
             self.inline_rows = 0
             raise
 
+    def _act(self, graph: Graph, arrays: Arrays, play: Play, state: Arrays | None) -> Actions:
+        if isinstance(graph, RemoteSearch):
+            graph = graph.bounded(play.deadline, play.analysis)
+        if self.is_sampled(play):
+            return graph.act(arrays, state=state, explore=True, rng=play.generators(_rows(arrays)))
+        if play.values == "distribution":
+            return graph.distribution(arrays, state=state)
+        return (graph.act if play.values is None else graph.outputs)(arrays, state=state)
+
     def signature(self, model: str) -> bytes:
         """The rest of a JSON response after its first fields. model: as in the request."""
         return _signature(model, self.number, self.sha256)
+
+
+def _rows(arrays: Arrays) -> int:
+    return len(next(iter(arrays.values())))
 
 
 @lru_cache(maxsize=1024)

@@ -33,7 +33,6 @@ from serve_app.inference.action_request import (
     build_response,
     decode_state,
     encode_state,
-    execute_request,
     is_plain,
     parse_action_request,
     pinned_version,
@@ -166,9 +165,9 @@ async def _response(
     plain = is_plain(request, policy, body.count(b'"'))
     observations = await read_observations(request, policy, plain, len(body))
     state = decode_state(request, policy, not plain)
-    output, is_greedy = await execute_request(request, policy, observations, state)
+    output = await policy.act(observations, request.play, state)
     if mirror is not None:
-        mirror(observations, state, output.actions if is_greedy else None)
+        mirror(observations, state, None if policy.is_sampled(request.play) else output.actions)
     response = build_response(request, output, observations, policy)
     if output.state is not None:
         if request.state is not None:

@@ -28,13 +28,13 @@ from league.refs import CHAMPION
 from serve_app.access.access_control import ADMISSION, KEY_HEADER, Admission
 from serve_app.access.errors import ErrorHandlers
 from serve_app.codecs.request_limits import LARGE_BODY
-from serve_app.inference.action_request import REPLICA, Arrays, generators
+from serve_app.inference.action_request import REPLICA, Arrays
 from serve_app.inference.plain_format import PlainFormat, PlainRequest, Target, Times
 from serve_app.inference.stream_session import InferenceDependencies
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.plain_infer import PlainInfer
 from serve_app.inference_protocol.rest import HEADER_LENGTH
-from serve_app.live_versions.policies import LoadedPolicy
+from serve_app.live_versions.policies import LoadedPolicy, Play
 from serve_app.live_versions.resolver import policy_ref
 from serve_app.live_versions.traffic_split import Headers
 from serve_app.routes.action import API, PATH_PREFIX, PATH_SUFFIX, ActionRoute
@@ -49,6 +49,7 @@ GROUP = 32
 """Requests that are parsed and answered together."""
 MAX_CACHED = 256
 """Length of the longest URL whose target is cached: callers can send any."""
+DEFAULT = Play()
 MODELS = "/v2/models/"
 """Prefix of the paths of the Open Inference Protocol."""
 
@@ -87,14 +88,9 @@ class JsonActions:
         observations = [observation for content in contents for observation in content.observations]
         return policy.reader.read(observations, is_plain=True, is_mixed=len(contents) > 1)
 
-    def run(self, policy: LoadedPolicy, arrays: Arrays, _: Sequence["JsonObservations"], rows: int) -> Actions:
+    def play(self, _: Sequence["JsonObservations"]) -> Play:
         """See `PlainFormat`."""
-        rng = generators(None, rows) if policy.samples else None
-        return policy.run_inline(lambda graph: graph.act(arrays, explore=rng is not None, rng=rng))
-
-    def is_greedy(self, policy: LoadedPolicy) -> bool:
-        """See `PlainFormat`."""
-        return not policy.samples
+        return DEFAULT
 
     def write(self, request: PlainRequest, output: Actions, rows: slice) -> tuple[bytes, bytes]:
         """See `PlainFormat`."""
@@ -253,7 +249,7 @@ class PlainActions:
             if rows > policy.inline_rows:  # of a batch before this one in the same turn
                 raise GraphTimeout("the policy is too slow for the event loop")
             arrays, read = format_of.read(policy, contents, rows), perf_counter_ns()
-            output, ran = format_of.run(policy, arrays, contents, rows), perf_counter_ns()
+            output, ran = policy.act_inline(arrays, play := format_of.play(contents)), perf_counter_ns()
         except LeagueError as error:
             # After a run that took too long, the application runs the policy in threads.
             for request in requests:
@@ -262,7 +258,7 @@ class PlainActions:
                 else:
                     self._answer(policy, format_of, [request])
             return
-        end, times, is_greedy = 0, Times(start, read, ran), format_of.is_greedy(policy)
+        end, times, is_greedy = 0, Times(start, read, ran), not policy.is_sampled(play)
         for request in requests:
             part = slice(end, end := end + request.rows)
             response = format_of.write(request, output, part)

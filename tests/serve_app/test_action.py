@@ -26,7 +26,7 @@ from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.live_versions import version_cache
-from serve_app.live_versions.policies import ActionSelections
+from serve_app.live_versions.policies import ActionSelections, Play
 from tests.support.clients.actions import BOARD, INVALID, act, b64, board_arrays, boards, inference, rejected
 from tests.support.leagues.protocol_leagues import DTYPES, FRAME, every_kind
 from tests.support.leagues.served_leagues import BOARD as SPACES
@@ -494,17 +494,18 @@ def test_a_version_that_does_not_end_is_not_loaded(registry: Registry, monkeypat
 
 
 @pytest.mark.anyio
-async def test_a_slow_policy_leaves_threads_to_others(registry: Registry) -> None:
+async def test_a_slow_policy_leaves_threads_to_others(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its callers wait for each other, not all others for them."""
     version = version_cache.load(registry, "board", 1, 0.0, ActionSelections())
     policy, ended = version.policy("shared"), threading.Event()
     policy.inline_rows = 0
 
-    def act(graph: OnnxPolicy) -> Actions:
+    def wait(*_: Any) -> Actions:
         ended.wait()
         return Actions(np.zeros(1))
 
-    runs = [asyncio.create_task(policy.run(act, 1)) for _ in range(64)]
+    monkeypatch.setattr(type(policy), "_act", wait)
+    runs = [asyncio.create_task(policy.act(policy.reader.zeros(1), Play())) for _ in range(64)]
     try:
         await asyncio.sleep(0)
         assert await asyncio.wait_for(asyncio.to_thread(lambda: "answered"), timeout=60) == "answered"

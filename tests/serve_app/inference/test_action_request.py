@@ -18,6 +18,7 @@ from league.spaces import Box, Leaf
 from serve_app.codecs.request_limits import LARGE_BODY, OVERHEAD_SIZE, RequestLimits
 from serve_app.codecs.state_tokens import common_version, read_state, read_token, write_tokens
 from serve_app.inference.action_request import KEYS, parse_action_request, pinned_version, reject_unknown_keys
+from serve_app.live_versions.policies import Play
 from tests.support.examples import examples
 
 MODEL, SHA256 = "memory.shared", "ab" * 32
@@ -45,8 +46,7 @@ def token_of(version: int, model: str = "memory.shared") -> str:
 def test_one_observation_is_a_batch_of_one() -> None:
     request = parse_action_request({"observation": [1, 2]}, max_batch=8)
     assert (request.observations, request.is_batch, request.strings) == ([[1, 2]], False, 1)
-    options = (request.explore, request.seed, request.probabilities, request.state, request.tokens)
-    assert options == (None, None, False, None, None)
+    assert (request.play, request.state, request.tokens) == (Play(), None, None)
 
 
 def test_all_options_are_parsed() -> None:
@@ -58,7 +58,7 @@ def test_all_options_are_parsed() -> None:
         "state": [token_of(7), None],
     }
     ask = parse_action_request(document, max_batch=8)
-    assert (ask.is_batch, ask.explore, ask.seed, ask.probabilities) == (True, True, [3, 4], True)
+    assert (ask.is_batch, ask.play) == (True, Play(explore=True, seed=[3, 4], values="distribution"))
     assert ask.tokens is not None
     assert [text and text.version for text in ask.tokens] == [7, None]
     assert ask.strings == 6, "five keys, one token"

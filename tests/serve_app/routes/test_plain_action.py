@@ -151,14 +151,14 @@ def test_requests_of_one_turn_are_one_batch(replica: Connections, monkeypatch: p
     champion = replica.server.alias_slots.champion("board")
     assert champion is not None
     policy, sizes = champion.policy(None), list[int]()
-    run = type(policy).run_inline
+    act = type(policy).act_inline
 
-    def record(policy: Any, act: Any) -> Any:
-        actions = run(policy, act)
+    def record(policy: Any, *arguments: Any) -> Any:
+        actions = act(policy, *arguments)
         sizes.append(len(actions.actions))
         return actions
 
-    monkeypatch.setattr(type(policy), "run_inline", record)
+    monkeypatch.setattr(type(policy), "act_inline", record)
     bodies = [{"observation": board} for board in boards(5)] + [{"observations": boards(3)}]
     answers = together(replica, replica.fast, [request(body) for body in bodies])
     assert sizes == [8]
@@ -220,14 +220,14 @@ def test_a_slow_policy_occupies_the_event_loop_once(replica: Connections, monkey
     policy = champion.policy(None)
     runs = 0
 
-    def take_long(policy: Any, act: Any) -> Any:
+    def take_long(policy: Any, *_: Any) -> Any:
         nonlocal runs
         runs += 1
         policy.inline_rows = 0
         raise GraphTimeout("too slow")
 
     monkeypatch.setattr(policy, "inline_rows", 8)
-    monkeypatch.setattr(type(policy), "run_inline", take_long)
+    monkeypatch.setattr(type(policy), "act_inline", take_long)
     bodies = [{"observations": boards(4)} for _ in range(5)]
     answers = together(replica, replica.fast, [request(body) for body in bodies])
     monkeypatch.undo()
