@@ -36,7 +36,7 @@ from serve_app.access.errors import ErrorHandlers
 from serve_app.access.permissions import Permissions
 from serve_app.evaluation_client import EvaluationClient, ServeEvaluationClient
 from serve_app.inference import stream_session
-from serve_app.inference.stream_session import InferenceDependencies
+from serve_app.inference.serving import Serving
 from serve_app.inference_protocol import grpc_handlers, inference
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.grpc_service import InferenceService
@@ -218,16 +218,14 @@ class Replica:
             on_replicas=lambda number: self.stream.replicas_counted(number),
         )
         self.access = AccessControl(self.api_keys, settings, Permissions(ROUTES), process.is_exposed)
-        self.action = ActionRoute(self.models, self.access, self.shadow, self.metrics, settings, replica)
-        dependencies = InferenceDependencies(
+        self.serving = Serving(
             self.models, self.alias_slots, self.traffic, self.shadow, self.metrics, self.access, settings
         )
+        self.action = ActionRoute(self.serving, replica)
+        self.inference = Inference(self.serving)
         # With an access log, the application answers all requests, and writes it.
-        self.inference = Inference(self.models, self.shadow, self.metrics, settings)
-        self.plain_actions = (
-            None if self.access_log else PlainActions(self.action, self.inference, dependencies, self.errors, replica)
-        )
-        self.stream = StreamRoute(dependencies, replica, process.is_draining)
+        self.plain_actions = None if self.access_log else PlainActions(self.inference, self.errors, replica)
+        self.stream = StreamRoute(self.serving, replica, process.is_draining)
         self.simulate = SimulateRoute(self.models, self.access, settings, process.is_draining)
         self.reporter = MetricsReporter(self.connection, self.metrics, self.shadow, self._statistics, replica, settings)
         self._load = LoadSampler(self.metrics)
@@ -243,8 +241,8 @@ class Replica:
     def _statistics(self) -> Report:
         sample = self._load.sample()
         in_flight = {
-            "action": self.action.in_flight,
-            "infer": self.inference.in_flight,
+            action.API: self.serving.in_flight[action.API],
+            inference.API: self.serving.in_flight[inference.API],
             "stream": self.stream.connections.open,
             "simulate": self.simulate.connections.open,
             "events": self.events.connections.open,
@@ -261,7 +259,7 @@ class Replica:
             self.action,
             self.stream,
             self.simulate,
-            InferRoute(self.inference, self.access, self.settings, self.replica),
+            InferRoute(self.inference, self.replica),
             RestRoutes(self.inference, self.catalogue, self.watcher),
             *OF_REGISTRY,
             TrafficRoutes(self.models, self.metrics, self.shadow, self.replica),

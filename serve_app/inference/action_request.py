@@ -18,7 +18,7 @@ from league.spaces.observation_codec import json_type, read_state, reject_string
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
 from serve_app.codecs.state_tokens import read_state as state_of_tokens
-from serve_app.live_versions.policies import LoadedPolicy, Play
+from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.resolver import version_of
 
 KEYS = frozenset(
@@ -40,7 +40,7 @@ class DecodedActionRequest:
     arrays."""
     tokens: list[StateToken | None] | None
     """Recurrent state as tokens, one per observation; None at the start of an episode."""
-    play: Play
+    options: ActionOptions
     strings: int
     """Number of strings in the document, including keys, except those in the observations."""
 
@@ -70,8 +70,8 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
         else:
             tokens = _tokens(state, len(observations) if is_batch else None)
             strings += sum(token is not None for token in tokens)
-    play = Play(explore, seed, "distribution" if probabilities else None, deadline, analysis)
-    return DecodedActionRequest(observations, is_batch, arrays, tokens, play, strings)
+    options = ActionOptions(explore, seed, "distribution" if probabilities else None, deadline, analysis)
+    return DecodedActionRequest(observations, is_batch, arrays, tokens, options, strings)
 
 
 def reject_unknown_keys(document: dict[str, Any], known: frozenset[str]) -> None:
@@ -189,10 +189,10 @@ def build_response(
     response: dict[str, Any] = {"actions": actions} if request.is_batch else {"action": actions[0]}
     if isinstance(answer, SearchedActions):
         rows: dict[str, list[Any]] = {"simulations": answer.simulations()}
-        if request.play.analysis:
+        if request.options.analysis:
             rows["analysis"] = answer.analyses()
         response |= rows if request.is_batch else {name: values[0] for name, values in rows.items()}
-    if request.play.values:
+    if request.options.values:
         assert answer.dist_inputs is not None
         # An action that is certain has the probability 1 even if it is illegal.
         mask = observations.get(ACTION_MASK) if policy.graph.has_distribution else None

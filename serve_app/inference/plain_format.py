@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Protocol
 
 from league.policies.policy import Actions
 from serve_app.inference.action_request import Arrays
-from serve_app.live_versions.policies import LoadedPolicy, Play
+from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.traffic_split import Headers
 from serve_app.runtime.uvicorn_http import HttpProtocol
 
@@ -46,9 +46,6 @@ class PlainFormat(Protocol):
     api: str
     """Name of its route in metrics."""
 
-    def in_flight(self) -> int:
-        """Requests of its route in flight, of which a replica has `max_in_flight` at most."""
-
     def parse(self, target: Target, headers: Headers, body: bytes, policy: LoadedPolicy) -> tuple[Any, int] | None:
         """The content and its number of rows. If it is None, the application answers, and if
         it raises JSONDecodeError, KeyError or LeagueError."""
@@ -56,7 +53,7 @@ class PlainFormat(Protocol):
     def read(self, policy: LoadedPolicy, contents: Sequence[Any], rows: int) -> Arrays:
         """The inputs of the graph for the contents of several requests. Raises LeagueError."""
 
-    def play(self, contents: Sequence[Any]) -> Play:
+    def options(self, contents: Sequence[Any]) -> ActionOptions:
         """How the actions of several requests are chosen."""
 
     def write(self, request: PlainRequest, output: Actions, rows: slice) -> tuple[bytes, bytes] | None:

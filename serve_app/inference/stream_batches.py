@@ -14,7 +14,7 @@ import numpy as np
 from league.errors import GraphTimeout, LeagueError
 from league.policies.policy import Actions
 from serve_app.inference.action_request import Arrays
-from serve_app.live_versions.policies import LoadedPolicy, Play
+from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.runtime.ray_serve import logger
 
 Outcome = Actions | Exception
@@ -26,17 +26,17 @@ class StreamBatches:
     def __init__(self) -> None:
         self._waiting: list[tuple[_Run, Callable[[Outcome], None]]] = []
 
-    async def act(self, policy: LoadedPolicy, observations: Arrays, rows: int, play: Play) -> Actions:
+    async def act(self, policy: LoadedPolicy, observations: Arrays, rows: int, options: ActionOptions) -> Actions:
         """Choose actions for the observations of a stream whose protocol knows `Deferred`.
 
         Large batches, and those of a policy that is too slow for the event loop, run alone in a thread.
         """
         if rows <= policy.inline_rows:
             try:
-                return await _Run(self, policy, observations, rows, play)
+                return await _Run(self, policy, observations, rows, options)
             except GraphTimeout:
                 pass
-        return await policy.act(observations, play)
+        return await policy.act(observations, options)
 
     def add(self, run: "_Run", loop: AbstractEventLoop, go_on: Callable[[Outcome], None]) -> None:
         """Do a run at the end of this turn, and call `go_on` with its outcome."""
@@ -46,9 +46,9 @@ class StreamBatches:
 
     def _take_turn(self) -> None:
         waiting, self._waiting = self._waiting, []
-        groups: dict[tuple[LoadedPolicy, Play], list[tuple[_Run, Callable[[Outcome], None]]]] = {}
+        groups: dict[tuple[LoadedPolicy, ActionOptions], list[tuple[_Run, Callable[[Outcome], None]]]] = {}
         for run, go_on in waiting:
-            groups.setdefault((run.policy, run.play), []).append((run, go_on))
+            groups.setdefault((run.policy, run.options), []).append((run, go_on))
         for (policy, _), group in groups.items():
             while group:
                 rows, count = 0, 0
@@ -71,7 +71,7 @@ class _Run(NamedTuple):
     policy: LoadedPolicy
     observations: Arrays
     rows: int
-    play: Play
+    options: ActionOptions
 
     def __await__(self) -> Generator["_Run", Actions, Actions]:
         return (yield self)
@@ -87,7 +87,7 @@ class _Run(NamedTuple):
 
 def _outcomes(runs: list[_Run], rows: int) -> list[Outcome]:
     """Run the messages of one policy as a batch. If that fails, each is run alone."""
-    policy, play = runs[0].policy, runs[0].play
+    policy, options = runs[0].policy, runs[0].options
     if rows > policy.inline_rows:  # of a batch before this one in the same turn
         return [GraphTimeout("the policy is too slow for the event loop")] * len(runs)
     if len(runs) == 1:
@@ -96,7 +96,7 @@ def _outcomes(runs: list[_Run], rows: int) -> list[Outcome]:
         names = runs[0].observations
         observations = {name: np.concatenate([run.observations[name] for run in runs]) for name in names}
     try:
-        actions = policy.act_inline(observations, play).actions
+        actions = policy.act_inline(observations, options).actions
     except Exception as error:
         if len(runs) > 1 and isinstance(error, LeagueError) and not isinstance(error, GraphTimeout):
             return [run.now() for run in runs]

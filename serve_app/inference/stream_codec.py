@@ -19,7 +19,7 @@ from league.policies.onnx import ACTION
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import check, check_mask
 from league.spaces.binary_leaves import little_endian
-from serve_app.live_versions.policies import LoadedPolicy, Play
+from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 
 FRAMING = 1
 REQUEST = struct.Struct("<BBHIQ")
@@ -32,7 +32,7 @@ class BinaryRequest(NamedTuple):
     """A request with a parsed header."""
 
     rows: int
-    play: Play
+    options: ActionOptions
     reset: bool
     resets: NDArray | None
     """(rows,) bool: where an episode starts."""
@@ -92,7 +92,7 @@ def parse_request(message: bytes, max_batch: int) -> BinaryRequest:
         begin += rows
         resets = _resets(message[REQUEST.size : begin], rows)
     tensors = memoryview(message)[begin:]
-    return BinaryRequest(rows, Play(explore, seed if has_seed else None), bool(flags & RESET), resets, tensors)
+    return BinaryRequest(rows, ActionOptions(explore, seed if has_seed else None), bool(flags & RESET), resets, tensors)
 
 
 def _resets(data: bytes, rows: int) -> NDArray:

@@ -5,7 +5,6 @@ policy, and members of a mixture, only when all its episodes start anew.
 """
 
 import asyncio
-from dataclasses import dataclass
 from math import ceil
 from time import perf_counter_ns
 from typing import Any
@@ -18,7 +17,7 @@ from league.errors import InvalidInput, InvalidState, LeagueError, RateLimited, 
 from league.policies.policy import Actions
 from league.refs import CHAMPION
 from league.spaces.observation_codec import json_type
-from serve_app.access.access_control import POLICY_VIOLATION, AccessControl
+from serve_app.access.access_control import POLICY_VIOLATION
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.errors import MalformedBody, status_of
 from serve_app.access.request_body import parse_json_object
@@ -37,17 +36,14 @@ from serve_app.inference.action_request import (
     read_observations,
     reject_unknown_keys,
 )
+from serve_app.inference.serving import Serving
 from serve_app.inference.stream_batches import StreamBatches
 from serve_app.inference.stream_codec import parse_request, read_tensors, write_actions
-from serve_app.live_versions.alias_slots import AliasSlots
-from serve_app.live_versions.policies import LoadedPolicy, Play
-from serve_app.live_versions.resolver import ModelResolver, policy_ref
-from serve_app.live_versions.shadow import Shadow
-from serve_app.live_versions.traffic_split import Headers, TrafficSplit, acting
-from serve_app.observability.metrics import Metrics
+from serve_app.live_versions.policies import LoadedPolicy
+from serve_app.live_versions.resolver import policy_ref
+from serve_app.live_versions.traffic_split import Headers, acting
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import CloseStream, StreamMessage
-from serve_app.settings import ServeSettings
 
 STREAM_ONLY_KEYS = frozenset(("reset", "return_state"))
 """Keys that the action route does not accept."""
@@ -55,19 +51,6 @@ INVALID_PAYLOAD = 1007
 API = "stream"
 """Name of stream messages in metrics."""
 INTERNAL_ERROR = {"code": "internal_error", "message": "internal server error; see the server log", "status": 500}
-
-
-@dataclass(frozen=True, slots=True)
-class InferenceDependencies:
-    """Objects that the streams and the fast path of a replica share."""
-
-    models: ModelResolver
-    slots: AliasSlots
-    traffic: TrafficSplit
-    shadow: Shadow
-    metrics: Metrics
-    access: AccessControl
-    settings: ServeSettings
 
 
 class StreamSession:
@@ -80,7 +63,7 @@ class StreamSession:
 
     def __init__(
         self,
-        dependencies: InferenceDependencies,
+        serving: Serving,
         model: str,
         policy: LoadedPolicy,
         follows: str | None,
@@ -88,7 +71,7 @@ class StreamSession:
         key: ApiKey | None,
         batches: StreamBatches | None = None,
     ) -> None:
-        self._dependencies = dependencies
+        self._serving = serving
         self._model = model
         self._ref = policy_ref(model)
         self._path = f"/v1/policies/{model}/stream"
@@ -104,24 +87,24 @@ class StreamSession:
     async def answer(self, data: bytes, is_text: bool) -> StreamMessage:
         """The answer to a message, or an error message. Raises CloseStream."""
         try:
-            self._dependencies.access.admit_message(self._key, len(data))
+            self._serving.access.admit_message(self._key, len(data))
             return await (self._answer_text(data) if is_text else self._answer_binary(data))
         except Unauthenticated as error:
-            self._dependencies.metrics.count_error(self._path, error.code)
+            self._serving.metrics.count_error(self._path, error.code)
             raise CloseStream(POLICY_VIOLATION, str(error)) from None
         except LeagueError as error:
-            self._dependencies.metrics.count_error(self._path, error.code)
-            return error_message(error, self._dependencies.settings.retry)
+            self._serving.metrics.count_error(self._path, error.code)
+            return error_message(error, self._serving.settings.retry)
         except CloseStream:
             raise
         except Exception as error:
             logger.error("a message of a stream failed", exc_info=error)
-            self._dependencies.metrics.count_error(self._path, str(INTERNAL_ERROR["code"]))
+            self._serving.metrics.count_error(self._path, str(INTERNAL_ERROR["code"]))
             return _text(INTERNAL_ERROR)
 
     def admit_frame(self) -> float:
         """Count a control frame or a fragment. Returns 0, or the number of seconds until it may be handled."""
-        return self._dependencies.access.admit_frame(self._key)
+        return self._serving.access.admit_frame(self._key)
 
     def closing_message(self) -> StreamMessage | None:
         """What a client needs to continue on another replica: the recurrent state, if any."""
@@ -132,7 +115,7 @@ class StreamSession:
     async def _answer_text(self, data: bytes) -> StreamMessage:
         start = perf_counter_ns()
         if is_large := len(data) > LARGE_BODY:
-            self._policy.limits.check_body(data, self._dependencies.settings.max_batch)
+            self._policy.limits.check_body(data, self._serving.settings.max_batch)
         document = await asyncio.to_thread(_parsed, data) if is_large else _parsed(data)
         reject_unknown_keys(document, KEYS | STREAM_ONLY_KEYS)
         stream_keys = document.keys() & STREAM_ONLY_KEYS
@@ -142,36 +125,35 @@ class StreamSession:
         return_state, reset = parse_flag(document, "return_state"), document.get("reset", False)
         for key in stream_keys:
             del document[key]
-        request = parse_action_request(document, self._dependencies.settings.max_batch)
+        request = parse_action_request(document, self._serving.settings.max_batch)
         if request.state is not None:
             raise InvalidState("state is an object, expected a token: streams do not accept arrays")
         is_anew = reset is True or ("state" in document and document["state"] is None)
         policy, state = await self._select(request, is_anew, _resets(reset, request))
         plain = is_plain(request, policy, data.count(b'"') - 2 * len(stream_keys))
         observations = await read_observations(request, policy, plain, len(data))
-        answer = await policy.act(observations, request.play, state)
-        self._mirror(policy, observations, state, answer, request.play)
+        answer = await self._serving.act(policy, observations, request.options, state)
         self._store_state(policy, answer, request.is_batch)
         response = build_response(request, answer, observations, policy)
         if return_state and self._state is not None:
             response["state"] = self._tokens()
         message = self._signed(response)
-        self._count(policy, len(request.observations), start)
+        self._serving.count(API, policy, len(request.observations), start)
         return message
 
     async def _answer_binary(self, data: bytes) -> StreamMessage:
         start = perf_counter_ns()
-        request = parse_request(data, self._dependencies.settings.max_batch)
+        request = parse_request(data, self._serving.settings.max_batch)
         policy, state = self._continue(request.rows, request.reset, request.resets)
         observations = read_tensors(policy, request)
-        if self._batches is not None and request.play.seed is None and not policy.state:
-            answer = await self._batches.act(policy, observations, request.rows, request.play)
+        if self._batches is not None and request.options.seed is None and not policy.state:
+            answer = await self._batches.act(policy, observations, request.rows, request.options)
+            self._serving.mirror(policy, observations, request.options, answer)
         else:
-            answer = await policy.act(observations, request.play, state)
-        self._mirror(policy, observations, state, answer, request.play)
+            answer = await self._serving.act(policy, observations, request.options, state)
         self._store_state(policy, answer, is_batch=request.rows > 1)
         message = StreamMessage(write_actions(policy, answer.actions), False)
-        self._count(policy, request.rows, start)
+        self._serving.count(API, policy, request.rows, start)
         return message
 
     async def _select(
@@ -187,7 +169,7 @@ class StreamSession:
         number = pinned_version(request, self._model, self._follows or str(self._policy.number))
         policy = self._policy
         if int(number) != policy.number:
-            policy = await self._dependencies.models.find(self._model, number)
+            policy = await self._serving.models.find(self._model, number)
         return policy, decode_state(request, policy)
 
     def _continue(self, rows: int, is_anew: bool, resets: NDArray | None) -> tuple[LoadedPolicy, Arrays | None]:
@@ -208,11 +190,11 @@ class StreamSession:
         """The policy that answers now, if no recurrent state depends on it. is_anew: whether episodes start."""
         version = None
         if self._follows is not None:
-            version = self._dependencies.slots.follow(self._ref.league, self._follows)
+            version = self._serving.slots.follow(self._ref.league, self._follows)
         if version is None:
             return self._policy
-        if self._follows == CHAMPION and self._dependencies.traffic.canaries:
-            version = self._dependencies.traffic.route(version, self._headers)
+        if self._follows == CHAMPION and self._serving.traffic.canaries:
+            version = self._serving.traffic.route(version, self._headers)
         # An episode stays with the member of a mixture that it began with.
         if version.mixture is not None:
             is_member = any(member.policies.get(self._policy.name) is self._policy for member in version.members)
@@ -220,16 +202,6 @@ class StreamSession:
                 return self._policy
             version = acting(version, self._headers)
         return version.policy(self._ref.policy)
-
-    def _mirror(
-        self, policy: LoadedPolicy, observations: Arrays, state: Arrays | None, answer: Actions, play: Play
-    ) -> None:
-        mirror = self._dependencies.shadow.mirror_for(policy)
-        if mirror is not None:
-            mirror(observations, state, None if policy.is_sampled(play) else answer.actions)
-
-    def _count(self, policy: LoadedPolicy, rows: int, begun: int) -> None:
-        self._dependencies.metrics.count_request(API, policy, rows, perf_counter_ns() - begun)
 
     def _store_state(self, policy: LoadedPolicy, answer: Actions, is_batch: bool) -> None:
         self._policy, self._state, self._is_batch = policy, answer.state, is_batch

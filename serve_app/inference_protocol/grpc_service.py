@@ -17,7 +17,7 @@ from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.field_count import check_fields, malformed
-from serve_app.inference_protocol.inference import Inference, InferRequest, InferResponse
+from serve_app.inference_protocol.inference import API, Inference, InferRequest, InferResponse
 from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
 from serve_app.inference_protocol.statistics import Document
 from serve_app.inference_protocol.tensors import Data, RequestTensor, datatype_of, to_bytes
@@ -159,7 +159,7 @@ class InferenceService:
             key = self._access.admit_rpc(metadata, rpc)
             if rpc in EMPTY:
                 return await self._answer(rpc, request_type())
-            with self._inference.admitted():
+            with self._inference.serving.admitted(API):
                 body = await self._read(context, self._settings.max_body if rpc == INFER else MAX_CHANGE_BODY)
                 if len(body) > LARGE_BODY:
                     self._access.admit_body(key, len(body))
@@ -173,7 +173,7 @@ class InferenceService:
                     check_counts(request, await self._inference.find(model, request.model_version, headers))
                 return await self._inference.infer(read_request(request, len(body)), write_response, headers)
         except LeagueError as error:
-            self._inference.metrics.count_error(f"/v2/models/{model}", error.code)
+            self._inference.serving.metrics.count_error(f"/v2/models/{model}", error.code)
             raise
 
     async def _read(self, context: grpc.aio.ServicerContext, limit: int) -> bytes:

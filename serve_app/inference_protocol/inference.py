@@ -2,26 +2,22 @@
 graph."""
 
 import asyncio
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter_ns
 from typing import NamedTuple, TypeVar
 
 from numpy.typing import NDArray
 
-from league.errors import InvalidInput, Overloaded
+from league.errors import InvalidInput
 from league.policies.onnx import ACTION, DIST_INPUTS, STATE_IN, STATE_OUT
 from league.policies.policy import Actions
 from league.refs import CHAMPION
 from serve_app.codecs.request_limits import LARGE_BODY
+from serve_app.inference.serving import Serving
 from serve_app.inference_protocol.statistics import Statistics
 from serve_app.inference_protocol.tensors import RequestTensor, read_inputs
-from serve_app.live_versions.policies import LoadedPolicy, Play
-from serve_app.live_versions.resolver import ModelResolver
-from serve_app.live_versions.shadow import MirrorFunction, Shadow
+from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.traffic_split import Headers
-from serve_app.observability.metrics import Metrics
-from serve_app.settings import ServeSettings
 
 T = TypeVar("T")
 API = "infer"
@@ -57,29 +53,13 @@ class InferResponse(NamedTuple):
 class Inference:
     """Executes inference requests of a replica. Runs on the event loop."""
 
-    def __init__(self, models: ModelResolver, shadow: Shadow, metrics: Metrics, settings: ServeSettings) -> None:
-        self._models = models
-        self._shadow = shadow
-        self.metrics = metrics
-        self._settings = settings
+    def __init__(self, serving: Serving) -> None:
+        self.serving = serving
         self.statistics = Statistics()
-        self.in_flight = 0
-        """Requests in flight."""
-
-    @contextmanager
-    def admitted(self) -> Iterator[None]:
-        """Count a request while it is in progress. Raises Overloaded."""
-        if self.in_flight >= self._settings.max_in_flight:
-            raise Overloaded(f"{self.in_flight} requests are in progress in this replica")
-        self.in_flight += 1
-        try:
-            yield
-        finally:
-            self.in_flight -= 1
 
     async def find(self, model: str, version: str, headers: Headers = ()) -> LoadedPolicy:
         """The policy that answers for a model. Raises the errors of `ModelResolver.find`."""
-        return await self._models.find(model, version or CHAMPION, headers)
+        return await self.serving.models.find(model, version or CHAMPION, headers)
 
     async def infer(self, request: InferRequest, encode: Callable[[InferResponse], T], headers: Headers = ()) -> T:
         """Execute a request and encode the response. Raises LeagueError.
@@ -88,7 +68,6 @@ class Inference:
         """
         start = perf_counter_ns()
         policy = await self.find(request.model, request.version, headers)
-        mirror = self._shadow.mirror_for(policy)
         lookup_end = perf_counter_ns()
         entry = self.statistics.entry(policy.model, policy.number)
         try:
@@ -97,8 +76,10 @@ class Inference:
                 raise InvalidInput("sequences are not supported: send state_out_<i> back as state_in_<i>")
             arrays = await self._read(request, policy)
             read = perf_counter_ns()
-            outputs = await _run(arrays, output_names, policy, mirror)
+            state = {name: array for name, array in arrays.items() if policy.inputs[name].is_state} or None
+            answer = await self.serving.act(policy, arrays, options_for(output_names), state)
             ran = perf_counter_ns()
+            outputs = {name: output_of(name, answer) for name in output_names}
             response = InferResponse(request.model, str(policy.number), request.id, outputs)
             encoded = encode(response)
         except BaseException:
@@ -107,13 +88,14 @@ class Inference:
         rows = len(next(iter(arrays.values())))
         done = perf_counter_ns()
         entry.succeed(rows, start, lookup_end, read, ran, done)
-        self.metrics.count_request(API, policy, rows, done - start)
+        self.serving.count(API, policy, rows, start)
         return encoded
 
     async def _read(self, request: InferRequest, policy: LoadedPolicy) -> dict[str, NDArray]:
+        max_batch = self.serving.settings.max_batch
         if request.size <= LARGE_BODY:
-            return read_inputs(request.inputs, policy, self._settings.max_batch)
-        return await asyncio.to_thread(read_inputs, request.inputs, policy, self._settings.max_batch)
+            return read_inputs(request.inputs, policy, max_batch)
+        return await asyncio.to_thread(read_inputs, request.inputs, policy, max_batch)
 
 
 def wanted_outputs(outputs: Sequence[str], policy: LoadedPolicy) -> Sequence[str]:
@@ -128,19 +110,9 @@ def wanted_outputs(outputs: Sequence[str], policy: LoadedPolicy) -> Sequence[str
     return outputs
 
 
-async def _run(
-    arrays: dict[str, NDArray], wanted: Sequence[str], policy: LoadedPolicy, mirror: MirrorFunction | None
-) -> dict[str, NDArray]:
-    state = {name: array for name, array in arrays.items() if policy.inputs[name].is_state} or None
-    answer = await policy.act(arrays, play_for(wanted), state)
-    if mirror is not None:
-        mirror({port.name: arrays[port.name] for port in policy.observed}, state, answer.actions)
-    return {name: output_of(name, answer) for name in wanted}
-
-
-def play_for(outputs: Iterable[str]) -> Play:
+def options_for(outputs: Iterable[str]) -> ActionOptions:
     """How actions are chosen if these outputs are requested: always greedily."""
-    return Play(explore=False, values="outputs" if DIST_INPUTS in outputs else None)
+    return ActionOptions(explore=False, values="outputs" if DIST_INPUTS in outputs else None)
 
 
 def output_of(name: str, answer: Actions) -> NDArray:

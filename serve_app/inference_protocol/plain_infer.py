@@ -18,14 +18,14 @@ from serve_app.inference_protocol.inference import (
     API,
     Inference,
     InferResponse,
+    options_for,
     output_of,
-    play_for,
     wanted_outputs,
 )
 from serve_app.inference_protocol.rest import BINARY, HEADER_LENGTH, JSON, framing
 from serve_app.inference_protocol.rest_codec import MIN_COMPRESSED_BYTES, RestRequest, read_request, write_response
 from serve_app.inference_protocol.tensors import read_inputs
-from serve_app.live_versions.policies import LoadedPolicy, Play
+from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.traffic_split import Headers
 
 MAX_HEAD = 1024
@@ -57,14 +57,10 @@ class PlainInfer:
 
     api = API
 
-    def __init__(self, inference: Inference, max_batch: int) -> None:
+    def __init__(self, inference: Inference) -> None:
         self._inference = inference
-        self._max_batch = max_batch
+        self._max_batch = inference.serving.settings.max_batch
         self._layouts: WeakKeyDictionary[LoadedPolicy, dict[bytes, Layout]] = WeakKeyDictionary()
-
-    def in_flight(self) -> int:
-        """See `PlainFormat`."""
-        return self._inference.in_flight
 
     def parse(
         self, target: Target, headers: Headers, body: bytes, policy: LoadedPolicy
@@ -113,9 +109,9 @@ class PlainInfer:
         tensors = map(b"".join, zip(*(content.tensors for content in contents), strict=True))
         return observations_of(policy, tensors, rows)
 
-    def play(self, contents: Sequence[BinaryTensors]) -> Play:
+    def options(self, contents: Sequence[BinaryTensors]) -> ActionOptions:
         """See `PlainFormat`."""
-        return play_for(chain.from_iterable(content.layout.outputs for content in contents))
+        return options_for(chain.from_iterable(content.layout.outputs for content in contents))
 
     def write(self, request: PlainRequest, output: Actions, rows: slice) -> tuple[bytes, bytes] | None:
         """See `PlainFormat`."""

@@ -13,18 +13,17 @@ from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
 from league.errors import InvalidInput, NotReady
-from serve_app.access.access_control import KEY, AccessControl
+from serve_app.access.access_control import KEY
 from serve_app.access.access_log import LOG_ENTRY, log_version
 from serve_app.access.request_body import MAX_CHANGE_BODY, parse_json_object, read_bytes
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.declaration import CALLER, REPLICA_HEADER, TIMEOUT, Declaration, Parameter
 from serve_app.inference.action_request import REPLICA
 from serve_app.inference_protocol.catalogue import ModelCatalogue
-from serve_app.inference_protocol.inference import Inference, InferResponse
+from serve_app.inference_protocol.inference import API, Inference, InferResponse
 from serve_app.inference_protocol.rest_codec import compressed, read_request, write_response
 from serve_app.live_versions.registry_watcher import RegistryWatcher
 from serve_app.live_versions.traffic_split import Headers
-from serve_app.settings import ServeSettings
 
 JSON, BINARY = b"application/json", b"application/octet-stream"
 BODIES = (JSON.decode(), BINARY.decode())
@@ -190,10 +189,9 @@ class RestRoutes:
 class InferRoute:
     """POST …/infer as a plain ASGI application: the hot path."""
 
-    def __init__(self, inference: Inference, access: AccessControl, settings: ServeSettings, replica: str) -> None:
+    def __init__(self, inference: Inference, replica: str) -> None:
         self._inference = inference
-        self._access = access
-        self._settings = settings
+        self._serving = inference.serving
         self._replica = (REPLICA, replica.encode())
 
     @of_model_and_version(
@@ -240,19 +238,19 @@ class InferRoute:
         the JSON part. Request (`Content-Encoding: gzip` or `deflate`) and response (`Accept-Encoding`) can be
         compressed.
         """
-        with self._inference.admitted():
+        with self._serving.admitted(API):
             await self._handle(scope, receive, send)
 
     async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         header_length, accepted = framing(scope["headers"])
-        turn = self._access.backlog.turn
-        body = await read_bytes(scope, receive, self._settings.max_body)
-        if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
-            self._access.admit_body(scope.get(KEY), len(body))
+        turn = self._serving.access.backlog.turn
+        body = await read_bytes(scope, receive, self._serving.settings.max_body)
+        if (is_large := len(body) > LARGE_BODY) or turn != self._serving.access.backlog.turn:
+            self._serving.access.admit_body(scope.get(KEY), len(body))
         model, version = scope["path_params"]["model"], scope["path_params"].get("version", "")
         if is_large:
             policy = await self._inference.find(model, version)
-            policy.limits.check_body(memoryview(body)[:header_length], self._settings.max_batch)
+            policy.limits.check_body(memoryview(body)[:header_length], self._serving.settings.max_batch)
             request = await asyncio.to_thread(read_request, model, version, body, header_length)
         else:
             request = read_request(model, version, body, header_length)

@@ -87,7 +87,7 @@ def output_ports(manifest: PolicyManifest) -> Ports:
     }
 
 
-class Play(NamedTuple):
+class ActionOptions(NamedTuple):
     """How the actions of a request are chosen, and what is returned with them."""
 
     explore: bool | None = None
@@ -177,40 +177,42 @@ class LoadedPolicy:
         """Whether actions are sampled if a request does not say, as in the league's matches."""
         return self.graph.has_distribution and self.selections[self.league] == "sampled"
 
-    def is_sampled(self, play: Play) -> bool:
+    def is_sampled(self, options: ActionOptions) -> bool:
         """Whether the actions of a request are sampled."""
-        return self.samples if play.explore is None else play.explore
+        return self.samples if options.explore is None else options.explore
 
-    async def act(self, arrays: Arrays, play: Play, state: Arrays | None = None) -> Actions:
+    async def act(self, arrays: Arrays, options: ActionOptions, state: Arrays | None = None) -> Actions:
         """Choose actions, in a thread if the batch is large.
 
         arrays: the inputs of the graph, with or without the state. Raises LeagueError.
         """
-        if play.analysis and self.search is None:
+        if options.analysis and self.search is None:
             raise InvalidInput("analysis is true, but this version does not search")
         if _rows(arrays) <= self.inline_rows:
             with suppress(GraphTimeout):
-                return self.act_inline(arrays, play, state)
+                return self.act_inline(arrays, options, state)
         async with self._threads:
             threads = None if self.search is None else self.search.threads
-            return await asyncio.get_running_loop().run_in_executor(threads, self._act, self.graph, arrays, play, state)
+            return await asyncio.get_running_loop().run_in_executor(
+                threads, self._act, self.graph, arrays, options, state
+            )
 
-    def act_inline(self, arrays: Arrays, play: Play, state: Arrays | None = None) -> Actions:
+    def act_inline(self, arrays: Arrays, options: ActionOptions, state: Arrays | None = None) -> Actions:
         """Choose actions on the event loop. Raises LeagueError."""
         try:
-            return self._act(self.inline_graph, arrays, play, state)
+            return self._act(self.inline_graph, arrays, options, state)
         except GraphTimeout:
             self.inline_rows = 0
             raise
 
-    def _act(self, graph: Graph, arrays: Arrays, play: Play, state: Arrays | None) -> Actions:
+    def _act(self, graph: Graph, arrays: Arrays, options: ActionOptions, state: Arrays | None) -> Actions:
         if isinstance(graph, RemoteSearch):
-            graph = graph.bounded(play.deadline, play.analysis)
-        if self.is_sampled(play):
-            return graph.act(arrays, state=state, explore=True, rng=play.generators(_rows(arrays)))
-        if play.values == "distribution":
+            graph = graph.bounded(options.deadline, options.analysis)
+        if self.is_sampled(options):
+            return graph.act(arrays, state=state, explore=True, rng=options.generators(_rows(arrays)))
+        if options.values == "distribution":
             return graph.distribution(arrays, state=state)
-        return (graph.act if play.values is None else graph.outputs)(arrays, state=state)
+        return (graph.act if options.values is None else graph.outputs)(arrays, state=state)
 
     def signature(self, model: str) -> bytes:
         """The rest of a JSON response after its first fields. model: as in the request."""

@@ -19,9 +19,9 @@ from typing import Any
 import orjson
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from league.errors import IllegalMask, InvalidState, NotReady, ObservationError, Overloaded
+from league.errors import IllegalMask, InvalidState, NotReady, ObservationError
 from league.refs import CHAMPION
-from serve_app.access.access_control import KEY, AccessControl
+from serve_app.access.access_control import KEY
 from serve_app.access.access_log import LOG_ENTRY, log_version
 from serve_app.access.request_body import parse_json_object, read_body
 from serve_app.codecs.request_limits import LARGE_BODY
@@ -39,12 +39,9 @@ from serve_app.inference.action_request import (
     read_observations,
     reject_unknown_keys,
 )
+from serve_app.inference.serving import Serving
 from serve_app.live_versions.policies import LoadedPolicy
-from serve_app.live_versions.resolver import ModelResolver
-from serve_app.live_versions.shadow import MirrorFunction, Shadow
-from serve_app.observability.metrics import Metrics
 from serve_app.routes.query_string import query_params
-from serve_app.settings import ServeSettings
 
 PATH_PREFIX, PATH_SUFFIX = "/v1/policies/", "/action"
 API = "action"
@@ -54,23 +51,9 @@ API = "action"
 class ActionRoute:
     """The endpoint as a plain ASGI application."""
 
-    def __init__(
-        self,
-        models: ModelResolver,
-        access: AccessControl,
-        shadow: Shadow,
-        metrics: Metrics,
-        settings: ServeSettings,
-        replica: str,
-    ) -> None:
-        self._models = models
-        self._access = access
-        self._shadow = shadow
-        self._metrics = metrics
-        self._settings = settings
+    def __init__(self, serving: Serving, replica: str) -> None:
+        self._serving = serving
         self._replica = (REPLICA, replica.encode())
-        self.in_flight = 0
-        """Requests in flight."""
 
     @Declaration(
         "POST",
@@ -100,41 +83,51 @@ class ActionRoute:
         start of an episode. The version that issued the token serves the episode until it ends, even if `champion`
         changes.
         """
-        if self.in_flight >= self._settings.max_in_flight:
-            raise Overloaded(f"{self.in_flight} requests are in progress in this replica")
-        self.in_flight += 1
-        try:
+        with self._serving.admitted(API):
             await self._handle(scope, receive, send)
-        finally:
-            self.in_flight -= 1
 
     async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
         start = perf_counter_ns()
-        turn = self._access.backlog.turn
-        body = await read_body(scope, receive, self._settings.max_body)
+        serving, max_batch = self._serving, self._serving.settings.max_batch
+        turn = serving.access.backlog.turn
+        body = await read_body(scope, receive, serving.settings.max_body)
         model, requested = scope["path_params"]["model"], query_params(scope).get("version", CHAMPION)
-        if (is_large := len(body) > LARGE_BODY) or turn != self._access.backlog.turn:
-            self._access.admit_body(scope.get(KEY), len(body))
+        if (is_large := len(body) > LARGE_BODY) or turn != serving.access.backlog.turn:
+            serving.access.admit_body(scope.get(KEY), len(body))
         if is_large:
             with suppress(NotReady):  # without a champion, a token in the body may name the version
-                policy = await self._models.find(model, requested)
-                policy.limits.check_body(body, self._settings.max_batch)
+                policy = await serving.models.find(model, requested)
+                policy.limits.check_body(body, max_batch)
             document = await asyncio.to_thread(parse_json_object, body)
         else:
             document = parse_json_object(body)
         reject_unknown_keys(document, KEYS)
-        request = parse_action_request(document, self._settings.max_batch)
-        members = await self._models.members(model, requested) if request.tokens and any(request.tokens) else ()
+        request = parse_action_request(document, max_batch)
+        members = await serving.models.members(model, requested) if request.tokens and any(request.tokens) else ()
         requested = pinned_version(request, model, requested, members)
-        policy = await self._models.find(model, requested, scope["headers"])
-        response = await _response(request, body, policy, self._shadow.mirror_for(policy))
+        policy = await serving.models.find(model, requested, scope["headers"])
+        response = await self._response(request, body, policy)
         if LOG_ENTRY in scope:
             log_version(scope, model, policy.number)
         content = orjson.dumps(response)[:-1] + policy.signature(model)
         headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(content)), self._replica]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": content})
-        self._metrics.count_request(API, policy, len(request.observations), perf_counter_ns() - start)
+        serving.count(API, policy, len(request.observations), start)
+
+    async def _response(self, request: DecodedActionRequest, body: bytes, policy: LoadedPolicy) -> dict[str, Any]:
+        plain = is_plain(request, policy, body.count(b'"'))
+        observations = await read_observations(request, policy, plain, len(body))
+        state = decode_state(request, policy, not plain)
+        output = await self._serving.act(policy, observations, request.options, state)
+        response = build_response(request, output, observations, policy)
+        if output.state is not None:
+            if request.state is not None:
+                response["state"] = {name: array.tolist() for name, array in output.state.items()}
+            else:
+                tokens = encode_state(output.state, policy)
+                response["state"] = tokens if request.is_batch else tokens[0]
+        return response
 
 
 class ActionDispatch:
@@ -154,25 +147,3 @@ class ActionDispatch:
                 await self._action(scope, receive, send)
                 return
         await self._application(scope, receive, send)
-
-
-async def _response(
-    request: DecodedActionRequest,
-    body: bytes,
-    policy: LoadedPolicy,
-    mirror: MirrorFunction | None,
-) -> dict[str, Any]:
-    plain = is_plain(request, policy, body.count(b'"'))
-    observations = await read_observations(request, policy, plain, len(body))
-    state = decode_state(request, policy, not plain)
-    output = await policy.act(observations, request.play, state)
-    if mirror is not None:
-        mirror(observations, state, None if policy.is_sampled(request.play) else output.actions)
-    response = build_response(request, output, observations, policy)
-    if output.state is not None:
-        if request.state is not None:
-            response["state"] = {name: array.tolist() for name, array in output.state.items()}
-        else:
-            tokens = encode_state(output.state, policy)
-            response["state"] = tokens if request.is_batch else tokens[0]
-    return response

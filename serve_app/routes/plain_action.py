@@ -30,14 +30,13 @@ from serve_app.access.errors import ErrorHandlers
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference.action_request import REPLICA, Arrays
 from serve_app.inference.plain_format import PlainFormat, PlainRequest, Target, Times
-from serve_app.inference.stream_session import InferenceDependencies
 from serve_app.inference_protocol.inference import Inference
 from serve_app.inference_protocol.plain_infer import PlainInfer
 from serve_app.inference_protocol.rest import HEADER_LENGTH
-from serve_app.live_versions.policies import LoadedPolicy, Play
+from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.resolver import policy_ref
 from serve_app.live_versions.traffic_split import Headers
-from serve_app.routes.action import API, PATH_PREFIX, PATH_SUFFIX, ActionRoute
+from serve_app.routes.action import API, PATH_PREFIX, PATH_SUFFIX
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_http import HttpProtocol
 
@@ -49,7 +48,7 @@ GROUP = 32
 """Requests that are parsed and answered together."""
 MAX_CACHED = 256
 """Length of the longest URL whose target is cached: callers can send any."""
-DEFAULT = Play()
+DEFAULT = ActionOptions()
 MODELS = "/v2/models/"
 """Prefix of the paths of the Open Inference Protocol."""
 
@@ -59,13 +58,8 @@ class JsonActions:
 
     api = API
 
-    def __init__(self, route: ActionRoute, max_batch: int) -> None:
-        self._route = route
+    def __init__(self, max_batch: int) -> None:
         self._max_batch = max_batch
-
-    def in_flight(self) -> int:
-        """See `PlainFormat`."""
-        return self._route.in_flight
 
     def parse(self, _: Target, __: Headers, body: bytes, policy: LoadedPolicy) -> tuple["JsonObservations", int] | None:
         """See `PlainFormat`."""
@@ -88,7 +82,7 @@ class JsonActions:
         observations = [observation for content in contents for observation in content.observations]
         return policy.reader.read(observations, is_plain=True, is_mixed=len(contents) > 1)
 
-    def play(self, _: Sequence["JsonObservations"]) -> Play:
+    def options(self, _: Sequence["JsonObservations"]) -> ActionOptions:
         """See `PlainFormat`."""
         return DEFAULT
 
@@ -115,23 +109,17 @@ class PlainActions:
 
     def __init__(
         self,
-        route: ActionRoute,
         inference: Inference,
-        dependencies: InferenceDependencies,
         errors: ErrorHandlers,
         replica: str,
     ) -> None:
-        self._json: PlainFormat = JsonActions(route, dependencies.settings.max_batch)
-        self._infer: PlainFormat = PlainInfer(inference, dependencies.settings.max_batch)
-        self._models = dependencies.models
-        self._access = dependencies.access
-        self._traffic = dependencies.traffic
-        self._shadow = dependencies.shadow
-        self._metrics = dependencies.metrics
-        self._max_in_flight = dependencies.settings.max_in_flight
-        self._root_path = dependencies.settings.root_path
+        self._serving = inference.serving
+        settings = self._serving.settings
+        self._json: PlainFormat = JsonActions(settings.max_batch)
+        self._infer: PlainFormat = PlainInfer(inference)
+        self._root_path = settings.root_path
         # The application adds the headers for pages of other origins.
-        self._not_plain = NOT_PLAIN | ({b"origin"} if dependencies.settings.cors_origins else set())
+        self._not_plain = NOT_PLAIN | ({b"origin"} if settings.cors_origins else set())
         self._errors = errors
         headers = [(REPLICA, replica.encode())]
         self._headers, self._headers_with_key = _lines(headers), _lines([*headers, KEY_HEADER])
@@ -172,7 +160,7 @@ class PlainActions:
             self._answer_group()
             if monotonic() > end:
                 break
-        self._access.backlog.queued = len(self._queue)
+        self._serving.access.backlog.queued = len(self._queue)
         self._has_turn = bool(self._queue)
         if self._has_turn:
             loop.call_soon(self._take_turn, loop)
@@ -188,7 +176,7 @@ class PlainActions:
         for connection in arrived:
             scope, path = cast(Scope, connection.scope), self._target(connection).path
             try:
-                scope[ADMISSION] = self._access.admission(scope, path)
+                scope[ADMISSION] = self._serving.access.admission(scope, path)
                 self._queue.append((time, connection))
             except LeagueError as error:
                 response = self._errors.response(path, error)
@@ -227,12 +215,11 @@ class PlainActions:
         scope, target = cast(Scope, connection.scope), self._target(connection)
         admission: Admission = scope[ADMISSION]
         format_of = self._json if target.is_action else self._infer
-        if format_of.in_flight() >= self._max_in_flight:
-            return None
         try:
-            if policy_ref(target.model).league in self._traffic.canaries:
+            self._serving.check_in_flight(format_of.api)
+            if policy_ref(target.model).league in self._serving.traffic.canaries:
                 return None
-            policy = self._models.find_loaded(target.model, target.version, scope["headers"])
+            policy = self._serving.models.find_loaded(target.model, target.version, scope["headers"])
             if policy is None or policy.state:
                 return None
             parsed = format_of.parse(target, scope["headers"], connection.body, policy)
@@ -249,7 +236,7 @@ class PlainActions:
             if rows > policy.inline_rows:  # of a batch before this one in the same turn
                 raise GraphTimeout("the policy is too slow for the event loop")
             arrays, read = format_of.read(policy, contents, rows), perf_counter_ns()
-            output, ran = policy.act_inline(arrays, play := format_of.play(contents)), perf_counter_ns()
+            output, ran = policy.act_inline(arrays, options := format_of.options(contents)), perf_counter_ns()
         except LeagueError as error:
             # After a run that took too long, the application runs the policy in threads.
             for request in requests:
@@ -258,7 +245,7 @@ class PlainActions:
                 else:
                     self._answer(policy, format_of, [request])
             return
-        end, times, is_greedy = 0, Times(start, read, ran), not policy.is_sampled(play)
+        end, times, is_greedy = 0, Times(start, read, ran), not policy.is_sampled(options)
         for request in requests:
             part = slice(end, end := end + request.rows)
             response = format_of.write(request, output, part)
@@ -266,12 +253,12 @@ class PlainActions:
                 request.connection.pass_on()
                 continue
             head, content = response
-            mirror = self._shadow.mirror_for(policy)
+            mirror = self._serving.shadow.mirror_for(policy)
             if mirror is not None:
                 mirrored: Arrays = {name: array[part] for name, array in arrays.items()}
                 mirror(mirrored, None, output.actions[part] if is_greedy else None)
             self._reply(request, head, content)
-            self._metrics.count_request(format_of.api, policy, request.rows, perf_counter_ns() - request.time)
+            self._serving.count(format_of.api, policy, request.rows, request.time)
             format_of.count(request, times, part.start == 0)
 
     def _reply(self, request: PlainRequest, head: bytes, content: bytes) -> None:

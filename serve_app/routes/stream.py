@@ -26,8 +26,9 @@ from serve_app.access.api_keys import ApiKey
 from serve_app.access.connection_limit import ConnectionLimit, within_descriptors
 from serve_app.declaration import ALIAS, CALLER, REPLICA_HEADER, VERSION, Declaration, Parameter
 from serve_app.inference.action_request import REPLICA
+from serve_app.inference.serving import Serving
 from serve_app.inference.stream_batches import StreamBatches
-from serve_app.inference.stream_session import InferenceDependencies, StreamSession
+from serve_app.inference.stream_session import StreamSession
 from serve_app.live_versions.resolver import policy_ref, version_of
 from serve_app.routes.query_string import query_params
 from serve_app.runtime.background import in_background
@@ -83,13 +84,11 @@ class OpenStream:
 class StreamRoute:
     """The endpoint as a plain ASGI application. is_draining: whether this replica is being stopped."""
 
-    def __init__(
-        self, dependencies: InferenceDependencies, replica: str, is_draining: Callable[[], bool] = lambda: False
-    ) -> None:
-        self._dependencies = dependencies
+    def __init__(self, serving: Serving, replica: str, is_draining: Callable[[], bool] = lambda: False) -> None:
+        self._serving = serving
         self._replica = replica
         self._is_draining = is_draining
-        settings = dependencies.settings
+        settings = serving.settings
         limit = within_descriptors(settings.max_streams)
         if limit < settings.max_streams:
             logger.warning(
@@ -176,7 +175,7 @@ class StreamRoute:
                 self._reconnect(WHILE_DRAINING)
             for stream in tuple(self._accepted):
                 try:
-                    self._dependencies.access.check_key(stream.key)
+                    self._serving.access.check_key(stream.key)
                 except Unauthenticated as error:
                     await self._close(stream, CloseStream(POLICY_VIOLATION, str(error)))
 
@@ -207,19 +206,17 @@ class StreamRoute:
             check_alias(follows)
             if not isinstance(version_of(query.get("version", "1")), int):
                 raise InvalidInput(f"version={query['version'][:64]!r} beside follow, expected a number")
-        policy = await self._dependencies.models.find(
-            model, follows or query.get("version", CHAMPION), scope["headers"]
-        )
+        policy = await self._serving.models.find(model, follows or query.get("version", CHAMPION), scope["headers"])
         if follows is not None and "version" in query:
             # An episode continues after a reconnection with the same member of the mixture that the alias names.
             number, ref = version_of(query["version"]), policy_ref(model)
-            named = self._dependencies.slots.get(ref.league, follows)
+            named = self._serving.slots.get(ref.league, follows)
             members = () if named is None else named.members
             policy = next((member.policy(ref.policy) for member in members if member.number == number), policy)
         headers = {b"x-league-version": str(policy.number), b"x-league-sha256": policy.sha256, REPLICA: self._replica}
         can_wait = STREAM_PROTOCOL in scope.get("extensions", {})
         stream = StreamSession(
-            self._dependencies,
+            self._serving,
             model,
             policy,
             follows,
@@ -236,8 +233,8 @@ class StreamRoute:
             text = message.get("text")
             data = message["bytes"] if text is None else text.encode()
             try:
-                if len(data) > self._dependencies.settings.max_body:
-                    raise CloseStream(TOO_BIG, f"a message is larger than {self._dependencies.settings.max_body} bytes")
+                if len(data) > self._serving.settings.max_body:
+                    raise CloseStream(TOO_BIG, f"a message is larger than {self._serving.settings.max_body} bytes")
                 response = await stream.answer(data, text is not None)
             except CloseStream as end:
                 await opened.close(end)

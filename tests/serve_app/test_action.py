@@ -26,7 +26,7 @@ from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.live_versions import version_cache
-from serve_app.live_versions.policies import ActionSelections, Play
+from serve_app.live_versions.policies import ActionOptions, ActionSelections
 from tests.support.clients.actions import BOARD, INVALID, act, b64, board_arrays, boards, inference, rejected
 from tests.support.leagues.protocol_leagues import DTYPES, FRAME, every_kind
 from tests.support.leagues.served_leagues import BOARD as SPACES
@@ -231,14 +231,14 @@ def test_other_methods_and_media_types_are_rejected(read_only_client: TestClient
 
 @pytest.mark.anyio
 @pytest.mark.parametrize(
-    ("path", "document", "handler"),
+    ("path", "document", "api"),
     [
         (ACTION, {"observation": BOARD}, "action"),
-        ("/v2/models/vector/infer", inference({"observation": np.zeros((1, 2), np.float32)}), "inference"),
+        ("/v2/models/vector/infer", inference({"observation": np.zeros((1, 2), np.float32)}), "infer"),
     ],
 )
 async def test_the_number_of_concurrent_requests_is_limited(
-    registry: Registry, path: str, document: dict[str, Any], handler: str
+    registry: Registry, path: str, document: dict[str, Any], api: str
 ) -> None:
     server = Replica(registry, QUICK.model_copy(update={"max_in_flight": 2}), "replica-1")
     resume = asyncio.Event()
@@ -250,7 +250,7 @@ async def test_the_number_of_concurrent_requests_is_limited(
     transport = httpx.ASGITransport(server.application())
     async with server.watcher.watching(), httpx.AsyncClient(transport=transport, base_url=LOCALHOST) as client:
         slow = [asyncio.create_task(client.post(path, content=body())) for _ in range(2)]
-        while getattr(server, handler).in_flight < 2:
+        while server.serving.in_flight[api] < 2:
             await asyncio.sleep(0)
         reply = await client.post(path, json=document)
         assert (reply.status_code, reply.headers["retry-after"]) == (429, "1")
@@ -505,7 +505,7 @@ async def test_a_slow_policy_leaves_threads_to_others(registry: Registry, monkey
         return Actions(np.zeros(1))
 
     monkeypatch.setattr(type(policy), "_act", wait)
-    runs = [asyncio.create_task(policy.act(policy.reader.zeros(1), Play())) for _ in range(64)]
+    runs = [asyncio.create_task(policy.act(policy.reader.zeros(1), ActionOptions())) for _ in range(64)]
     try:
         await asyncio.sleep(0)
         assert await asyncio.wait_for(asyncio.to_thread(lambda: "answered"), timeout=60) == "answered"

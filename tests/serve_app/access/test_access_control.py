@@ -279,7 +279,7 @@ async def test_a_response_that_is_not_read_is_not_started_twice(registry: Regist
     async with application.router.lifespan_context(application):
         await application(scope, receive, send)
     assert sent == ["http.response.start", "http.response.body"]
-    assert server.action.in_flight == 0
+    assert server.serving.in_flight["action"] == 0
 
 
 @pytest.mark.anyio
@@ -298,7 +298,7 @@ async def test_a_body_that_does_not_arrive_times_out(registry: Registry) -> None
                 reply = await client.post(path, content=slow_body())
                 assert (reply.status_code, reply.headers["connection"]) == (408, "close")
             assert (await client.post(ACTION, json=BODY)).status_code == 200
-    assert server.action.in_flight == 0
+    assert server.serving.in_flight["action"] == 0
 
 
 @pytest.mark.anyio

@@ -18,7 +18,7 @@ from league.spaces import Box, Leaf
 from serve_app.codecs.request_limits import LARGE_BODY, OVERHEAD_SIZE, RequestLimits
 from serve_app.codecs.state_tokens import common_version, read_state, read_token, write_tokens
 from serve_app.inference.action_request import KEYS, parse_action_request, pinned_version, reject_unknown_keys
-from serve_app.live_versions.policies import Play
+from serve_app.live_versions.policies import ActionOptions
 from tests.support.examples import examples
 
 MODEL, SHA256 = "memory.shared", "ab" * 32
@@ -46,7 +46,7 @@ def token_of(version: int, model: str = "memory.shared") -> str:
 def test_one_observation_is_a_batch_of_one() -> None:
     request = parse_action_request({"observation": [1, 2]}, max_batch=8)
     assert (request.observations, request.is_batch, request.strings) == ([[1, 2]], False, 1)
-    assert (request.play, request.state, request.tokens) == (Play(), None, None)
+    assert (request.options, request.state, request.tokens) == (ActionOptions(), None, None)
 
 
 def test_all_options_are_parsed() -> None:
@@ -58,7 +58,7 @@ def test_all_options_are_parsed() -> None:
         "state": [token_of(7), None],
     }
     ask = parse_action_request(document, max_batch=8)
-    assert (ask.is_batch, ask.play) == (True, Play(explore=True, seed=[3, 4], values="distribution"))
+    assert (ask.is_batch, ask.options) == (True, ActionOptions(explore=True, seed=[3, 4], values="distribution"))
     assert ask.tokens is not None
     assert [text and text.version for text in ask.tokens] == [7, None]
     assert ask.strings == 6, "five keys, one token"

@@ -39,7 +39,7 @@ from serve_app.inference.stream_codec import (
     read_tensors,
     write_actions,
 )
-from serve_app.live_versions.policies import ActionSelections, LoadedPolicy, Play
+from serve_app.live_versions.policies import ActionOptions, ActionSelections, LoadedPolicy
 from serve_app.live_versions.version_cache import load
 from tests.support.clients.actions import BOARD, act, board_arrays, boards
 from tests.support.clients.streams import answer_to, open_stream, send
@@ -474,7 +474,7 @@ def test_requests_survive_encoding(policies: dict[str, LoadedPolicy], data: dict
     if has_resets:  # makes the tensors unaligned
         message = bytes((1, message[1] | HAS_RESETS)) + message[2:16] + bytes(data["rows"]) + message[16:]
     read = parse_request(message, MAX_ROWS)
-    assert read.play == Play(data["explore"], data["seed"])
+    assert read.options == ActionOptions(data["explore"], data["seed"])
     assert (read.rows, read.reset) == (data["rows"], data["reset"])
     assert (read.resets is not None) == has_resets
     decoded = read_tensors(policies["kinds"], read)
@@ -554,7 +554,7 @@ async def together(policy: LoadedPolicy, messages: list[Arrays], explore: bool =
     waiting, outcomes, loop = StreamBatches(), [None] * len(messages), asyncio.get_running_loop()
     for index, observations in enumerate(messages):
         rows = len(observations["action_mask"])
-        steps = waiting.act(policy, observations, rows, Play(explore)).__await__()
+        steps = waiting.act(policy, observations, rows, ActionOptions(explore)).__await__()
 
         def go_on(outcome: Any, steps: Any = steps, index: int = index) -> None:
             try:

@@ -161,7 +161,7 @@ def test_a_message_that_does_not_arrive_is_not_waited_for(leagues: Storage) -> N
             infer = channel.stream_unary(f"/{grpc_handlers.SERVICE}/ModelInfer")
             with pytest.raises(grpc.RpcError, match=r"did not arrive within 0\.1 s") as caught:
                 infer(never())
-            assert slow.server.inference.in_flight == 0
+            assert slow.server.serving.in_flight["infer"] == 0
         ends.set()
     assert caught.value.code() == grpc.StatusCode.DEADLINE_EXCEEDED  # type: ignore[attr-defined]
 
@@ -169,7 +169,7 @@ def test_a_message_that_does_not_arrive_is_not_waited_for(leagues: Storage) -> N
 def test_the_number_of_concurrent_calls_is_limited(
     call: Call, replica: InProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(replica.server.inference, "in_flight", 10**6)
+    monkeypatch.setitem(replica.server.serving.in_flight, "infer", 10**6)
     assert "in progress in this replica" in error_of(call, vector())
 
 

@@ -343,7 +343,7 @@ def test_shadows_canaries_and_mixtures(tmp_path: Path) -> None:
 
 def test_a_full_replica_refuses(tmp_path: Path) -> None:
     with changing(Storage.at(tmp_path / "home"), AT_ONCE.model_copy(update={"max_in_flight": 1})) as (replica, _):
-        replica.server.action.in_flight = 1
+        replica.server.serving.in_flight["action"] = 1
         data = request({"observation": BOARD})
         assert exchange(replica.fast, data).startswith(b"HTTP/1.1 429")
         assert exchange(replica.fast, data) == exchange(replica.general, data)
