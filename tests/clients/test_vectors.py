@@ -19,6 +19,7 @@ from policy_league_client.requests import ActionRequest, BatchActionRequest, to_
 from policy_league_client.seeds import derive
 from policy_league_client.simulator import ActionRows, Report, SimulatorConnection
 from serve_app.inference.stream_codec import RESPONSE, encode_request, parse_request
+from serve_app.live_versions.policies import ActionOptions
 
 FOLDER = Path(__file__).parents[2] / "clients/vectors"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())
@@ -56,7 +57,7 @@ def test_binary_requests(case: dict[str, Any]) -> None:
     message, tensors = (FOLDER / case["file"]).read_bytes(), [array(tensor) for tensor in case["inputs"]]
     seed, reset = int(case["seed"]) if "seed" in case else None, case["reset"]
     request = parse_request(message, max_batch=2)
-    assert (request.rows, request.explore, request.seed) == (case["rows"], case.get("explore"), seed)
+    assert (request.rows, request.options) == (case["rows"], ActionOptions(case.get("explore"), seed))
     assert bytes(request.tensors) == b"".join(tensor.tobytes() for tensor in tensors)
     if isinstance(reset, list):
         assert request.resets is not None

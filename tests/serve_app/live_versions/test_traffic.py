@@ -404,14 +404,14 @@ def test_a_failing_candidate_is_counted_and_does_not_affect_requests(
     shadowed: TestClient, server: Replica, registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     set_shadow(registry)
-    monkeypatch.setattr(shadow_policy(server, 2), "act", Mock(side_effect=MemoryError("no room")))
+    monkeypatch.setattr(shadow_graph(server, 2), "act", Mock(side_effect=MemoryError("no room")))
     for _ in range(10):
         assert act(shadowed, observation=BOARD)["version"] == 1
     counts = wait_for(registry, lambda one: one.failed == 10)
     assert (counts.requests, counts.agreed) == (0, 0)
 
 
-def shadow_policy(server: Replica, version: int) -> OnnxPolicy:
+def shadow_graph(server: Replica, version: int) -> OnnxPolicy:
     """The policy of a version of `board` with which a shadow runs."""
     candidate = server.versions.cached("board", version)
     assert candidate is not None
@@ -431,7 +431,7 @@ def test_a_run_that_does_not_end_is_counted(
         assert act(shadowed, observation=FULL)["version"] == 1
     counts = wait_for(registry, lambda one: one.failed == 20, candidate=endless)
     assert counts.requests == 0
-    monkeypatch.setattr(shadow_policy(server, endless), "_timeout", 60.0)  # a busy machine may need more than 0.1 s
+    monkeypatch.setattr(shadow_graph(server, endless), "_timeout", 60.0)  # a busy machine may need more than 0.1 s
     act(shadowed, observation=BOARD)
     wait_for(registry, lambda one: one.requests == 1, candidate=endless)
 
@@ -442,7 +442,7 @@ def test_runs_end_when_the_shadow_is_switched_off(
     monkeypatch.setattr("serve_app.live_versions.policies.SHADOW_TIMEOUT", 600.0)
     endless = publish(registry, "board", {"shared": endless_mlp()}, "run/endless").number
     set_shadow(registry, version=endless)
-    owner = shadow_policy(server, endless)._owner
+    owner = shadow_graph(server, endless)._owner
     assert owner is not None
 
     def runs() -> int:
