@@ -54,7 +54,8 @@ class ObservationReader:
                         rows[place] = decode(name, row, leaf)
                     else:
                         reject_strings(row)
-            array = _bytes(rows, leaf) if leaf.dtype in BYTES else None
+            # Otherwise rows may be decoded arrays.
+            array = _bytes(rows, leaf) if is_plain and leaf.dtype in BYTES else None
             if array is None:
                 array = _array(name, rows, leaf)
             if is_mixed and array.dtype.kind == "f" and not (np.abs(array) <= EXACT).all():
