@@ -102,6 +102,7 @@ def sides(storages: Sequence[Storage]) -> Iterator[dict[bool, Side]]:
     uvicorn_websocket.install(READ_ONLY.max_body, READ_ONLY.max_incomplete)
     with ExitStack() as stack:
         monkeypatch = stack.enter_context(pytest.MonkeyPatch.context())
+        monkeypatch.setattr(grpc_handlers, "_service", None)  # of this process: restored at the end
         yield {
             has_keys: stack.enter_context(_side(storage, has_keys, monkeypatch))
             for has_keys, storage in zip((False, True), storages, strict=True)

@@ -1,6 +1,6 @@
 """The leagues and the API keys to which the cases of the corpus are addressed."""
 
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 
 from league.interface import AgentInterface
 from league.registry.registry import Registry
@@ -73,7 +73,7 @@ def create_keys(registry: Registry) -> dict[str, str]:
         "duo": {"scopes": ["act"], "only_leagues": ["duo"]},
         "spent": {"scopes": ["act"], "rate": 0.001},
         "revoked": {"scopes": ["act"]},
-        "expired": {"scopes": ["act"], "expires_at": datetime.now(UTC) + timedelta(seconds=0.1)},
+        "expired": {"scopes": ["act"], "expires_at": datetime.now(UTC)},
     }
     keys = {name: registry.keys.create(name, **limit)[1] for name, limit in limits.items()}
     registry.keys.revoke("revoked")
