@@ -18,6 +18,7 @@ from ray import serve
 from ray.serve import Application
 from ray.serve.handle import DeploymentHandle
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 from starlette.middleware.exceptions import ExceptionMiddleware
 from starlette.responses import RedirectResponse
@@ -58,13 +59,13 @@ from serve_app.observability.metrics import Metrics, Report
 from serve_app.observability.metrics_reporter import MetricsReporter
 from serve_app.openapi.document import document
 from serve_app.routes import action
-from serve_app.routes.action import ActionDispatch, ActionRoute
+from serve_app.routes.action import ActionRoute
 from serve_app.routes.endpoints import routes_of
 from serve_app.routes.evaluations import EvaluationRoutes
 from serve_app.routes.events import EventBroker, EventRoutes
 from serve_app.routes.games import GameRoutes
+from serve_app.routes.inference_queue import InferenceQueue
 from serve_app.routes.pages import DocsRoutes, PageRoutes
-from serve_app.routes.plain_action import PlainActions
 from serve_app.routes.simulate import SimulateRoute
 from serve_app.routes.status import StatusRoutes
 from serve_app.routes.stream import StreamRoute
@@ -140,7 +141,7 @@ class PolicyServer(ray_serve.AsgiReplica):
         """The application of this replica."""
         application = self._replica.application()
         serve_bypass.install(application, self._replica.settings.root_path)
-        uvicorn_http.install(self._replica.events.end, self._replica.plain_actions)
+        uvicorn_http.install(self._replica.events.end, self._replica.plain)
         uvicorn_websocket.install(self._replica.settings.max_body, self._replica.settings.max_incomplete)
         grpc_handlers.install(self._replica.inference_service)
         collect_rarely()
@@ -224,7 +225,8 @@ class Replica:
         self.action = ActionRoute(self.serving, replica)
         self.inference = Inference(self.serving)
         # With an access log, the application answers all requests, and writes it.
-        self.plain_actions = None if self.access_log else PlainActions(self.inference, self.errors, replica)
+        self.infer = InferRoute(self.inference, replica)
+        self.plain = None if self.access_log else InferenceQueue(self.action, self.infer, self.errors, replica)
         self.stream = StreamRoute(self.serving, replica, process.is_draining)
         self.simulate = SimulateRoute(self.models, self.access, settings, process.is_draining)
         self.reporter = MetricsReporter(self.connection, self.metrics, self.shadow, self._statistics, replica, settings)
@@ -259,7 +261,7 @@ class Replica:
             self.action,
             self.stream,
             self.simulate,
-            InferRoute(self.inference, self.replica),
+            self.infer,
             RestRoutes(self.inference, self.catalogue, self.watcher),
             *OF_REGISTRY,
             TrafficRoutes(self.models, self.metrics, self.shadow, self.replica),
@@ -276,8 +278,7 @@ class Replica:
         _redirect_slashes(application.router)
         # Starlette's own stack has its middleware for bugs outermost, where it costs every request, and responses to
         # bugs lack the headers of the others.
-        stack: ASGIApp = ExceptionMiddleware(application.router, self.errors.handlers())
-        stack = ActionDispatch(stack, self.action)
+        stack: ASGIApp = ExceptionMiddleware(application.router, {HTTPException: self.errors.http_error})
         stack = AccessControlMiddleware(stack, self.access, self.errors, self.settings, self.access_log)
         if origins := self.settings.cors_origins:
             stack = CORSMiddleware(

@@ -11,7 +11,7 @@ long-lived.
 
 from collections.abc import Awaitable, Iterable
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -247,23 +247,20 @@ class AccessControlMiddleware:
                 await run_within(timeout, self._application(scope, receive, response.send))
         except TimeLimitExceeded:
             if not response.has_started:  # otherwise the client is not reading, and uvicorn closes the connection
-                await self._refuse(_timed_out(scope, timeout), scope, receive, response.send)
+                await self._refuse(_timed_out(scope, timeout), scope, receive, response)
         except Exception as error:
-            if isinstance(error, LeagueError) and not response.has_started:
-                await self._refuse(error, scope, receive, response.send)
-                return
-            if kind == "http":
-                await self._report(error, scope, receive, response)
-            raise
+            is_refusal = isinstance(error, LeagueError) and not response.has_started
+            if is_refusal or kind == "http":
+                await self._refuse(error, scope, receive, response)
+            if not is_refusal:
+                raise
 
-    async def _refuse(self, error: LeagueError, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _refuse(self, error: Exception, scope: Scope, receive: Receive, response: "ResponseTracker") -> None:
         if scope["type"] == "websocket" and DENIAL not in scope.get("extensions", {}):
-            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": error.public_message[:120]})
+            reason = cast(LeagueError, error).public_message[:120]
+            await response.send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
             return
-        await self._errors.response(_path(scope), error)(scope, receive, send)
-
-    async def _report(self, bug: Exception, scope: Scope, receive: Receive, response: "ResponseTracker") -> None:
-        answer = self._errors.internal_error(_path(scope), bug)
+        answer = self._errors.response(_path(scope), error)
         if not response.has_started:
             await answer(scope, receive, response.send)
 

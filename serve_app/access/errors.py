@@ -89,7 +89,7 @@ def status_of(error: LeagueError) -> int:
 
 
 class ErrorHandlers:
-    """Makes the responses to errors. Some methods are Starlette's exception handlers.
+    """Makes the responses to errors.
 
     retry: `Retry-After` of a 503, in seconds. count: called with the path and code of each error.
     """
@@ -103,17 +103,12 @@ class ErrorHandlers:
             503: {"retry-after": str(max(1, round(retry)))},
         }
 
-    def handlers(self) -> dict[Any, Any]:
-        """Exception class → handler."""
-        return {LeagueError: self.league_error, HTTPException: self.http_error}
-
-    async def league_error(self, request: Request, error: Exception) -> Response:
-        """Handle a LeagueError."""
-        assert isinstance(error, LeagueError)
-        return self.response(request.scope["path"], error)
-
-    def response(self, path: str, error: LeagueError) -> Response:
-        """The error response to a request for `path`."""
+    def response(self, path: str, error: Exception) -> Response:
+        """The error response to a request for `path`. The traceback of a bug goes to the log, not to the client."""
+        if not isinstance(error, LeagueError):
+            logger.error("a request failed", exc_info=error)
+            self._count(path, "internal_error")
+            return error_response(path, 500, "internal_error", "internal server error; see the server log")
         status = status_of(error)
         if status >= 500:
             logger.error("%s: %s", error.code, error)
@@ -124,7 +119,7 @@ class ErrorHandlers:
         return error_response(path, status, error.code, error.public_message, headers)
 
     async def http_error(self, request: Request, error: Exception) -> Response:
-        """Handle an error of Starlette's router."""
+        """Starlette's exception handler for errors of the router."""
         assert isinstance(error, HTTPException)
         path, headers = request.url.path[:200], error.headers
         message = f"no route matches {path}" if error.status_code == 404 else error.detail
@@ -138,12 +133,6 @@ class ErrorHandlers:
         code = CODES.get(error.status_code, "http_error")
         self._count(request.scope["path"], code)
         return error_response(request.scope["path"], error.status_code, code, message, headers)
-
-    def internal_error(self, path: str, error: Exception) -> Response:
-        """The response to a request for `path` that met a bug. The traceback goes to the log, not to the client."""
-        logger.error("a request failed", exc_info=error)
-        self._count(path, "internal_error")
-        return error_response(path, 500, "internal_error", "internal server error; see the server log")
 
 
 def error_response(path: str, status: int, code: str, message: str, headers: Any = None) -> Response:

@@ -1,23 +1,23 @@
 """An action request: parsed and checked, executed, and encoded as a response."""
 
-import asyncio
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, InvalidInput, InvalidState
 from league.policies.draws import probabilities
-from league.policies.policy import Actions
+from league.policies.policy import Arrays
 from league.search.searched_actions import SearchedActions
 from league.spaces import ACTION_MASK
 from league.spaces.observation_codec import json_type, read_state, reject_strings
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
 from serve_app.codecs.state_tokens import read_state as state_of_tokens
+from serve_app.inference.batches import Answer
 from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.resolver import version_of
 
@@ -43,6 +43,11 @@ class DecodedActionRequest:
     options: ActionOptions
     strings: int
     """Number of strings in the document, including keys, except those in the observations."""
+    booleans: int
+    """Likewise of booleans."""
+
+
+DEFAULT = ActionOptions()
 
 
 def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedActionRequest:
@@ -58,6 +63,8 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
         raise InvalidInput("observations is empty, expected at least one")
     if len(observations) > max_batch:
         raise BodyTooLarge(f"observations has {len(observations)} items, expected at most {max_batch}")
+    if len(document) == 1:
+        return DecodedActionRequest(observations, is_batch, None, None, DEFAULT, 1, 0)
     explore = parse_flag(document, "explore") if "explore" in document else None
     probabilities = parse_flag(document, "probabilities")
     analysis, deadline = parse_flag(document, "analysis"), _deadline(document.get("deadline_ms"))
@@ -71,7 +78,8 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
             tokens = _tokens(state, len(observations) if is_batch else None)
             strings += sum(token is not None for token in tokens)
     options = ActionOptions(explore, seed, "distribution" if probabilities else None, deadline, analysis)
-    return DecodedActionRequest(observations, is_batch, arrays, tokens, options, strings)
+    booleans = sum(type(value) is bool for value in document.values())
+    return DecodedActionRequest(observations, is_batch, arrays, tokens, options, strings, booleans)
 
 
 def reject_unknown_keys(document: dict[str, Any], known: frozenset[str]) -> None:
@@ -141,15 +149,40 @@ def _deadline(milliseconds: Any) -> float:
     return monotonic() + milliseconds / 1000
 
 
-Arrays = dict[str, NDArray]
+class JsonObservations(NamedTuple):
+    """See `Observations`."""
+
+    observations: list[Any]
+    is_plain: bool
+    """Whether no value is a string."""
+    is_joinable: bool
+    is_large: bool
+
+    @property
+    def rows(self) -> int:
+        """See `Observations`."""
+        return len(self.observations)
+
+    @staticmethod
+    def read(policy: LoadedPolicy, parts: Sequence["JsonObservations"]) -> Arrays:
+        """See `Observations`. Raises ObservationError, IllegalMask or BodyTooLarge."""
+        if len(parts) == 1:
+            return policy.reader.read(parts[0].observations, parts[0].is_plain)
+        return policy.reader.read([value for part in parts for value in part.observations], True, is_mixed=True)
 
 
-def is_plain(request: DecodedActionRequest, policy: LoadedPolicy, quotes: int) -> bool:
-    """Whether no value is a string, from the number of quotation marks in the body: two per string.
-
-    More strings than keys mean that a key is wrong or a leaf is base64.
-    """
-    return quotes == 2 * (request.strings + len(request.observations) * policy.reader.keys)
+def observations_of(
+    request: DecodedActionRequest, policy: LoadedPolicy, body: bytes, strings: int = 0
+) -> JsonObservations:
+    """The observations of a request, in a body with `strings` further strings. Raises BodyTooLarge."""
+    observations = request.observations
+    policy.limits.check_size(len(body), len(observations))
+    # Two quotation marks per string. More strings than keys mean that a key is wrong or a leaf is base64.
+    is_plain = body.count(b'"') == 2 * (request.strings + strings + len(observations) * policy.reader.keys)
+    is_large = len(body) > LARGE_BODY
+    # In one array with numbers of other requests, booleans would become numbers.
+    is_joinable = is_plain and not is_large and body.count(b"true") + body.count(b"false") == request.booleans
+    return JsonObservations(observations, is_plain, is_joinable, is_large)
 
 
 def decode_state(request: DecodedActionRequest, policy: LoadedPolicy, has_strings: bool = True) -> Arrays | None:
@@ -165,40 +198,24 @@ def decode_state(request: DecodedActionRequest, policy: LoadedPolicy, has_string
     return read_state(request.state, policy.state, len(request.observations))
 
 
-async def read_observations(request: DecodedActionRequest, policy: LoadedPolicy, plain: bool, size: int) -> Arrays:
-    """Decode the observations, in a thread if the body is large. plain: see `is_plain`. size: bytes of the body.
-
-    Raises ObservationError, IllegalMask or BodyTooLarge.
-    """
-    policy.limits.check_size(size, len(request.observations))
-    if size <= LARGE_BODY:
-        return policy.reader.read(request.observations, plain)
-    return await asyncio.to_thread(policy.reader.read, request.observations, plain)
-
-
-def encode_state(state: Arrays, policy: LoadedPolicy) -> list[str]:
+def encode_state(state: dict[str, NDArray], policy: LoadedPolicy) -> list[str]:
     """Encode a state as tokens."""
     return write_tokens(policy.qualified, policy.number, policy.sha256, state)
 
 
-def build_response(
-    request: DecodedActionRequest, answer: Actions, observations: Arrays, policy: LoadedPolicy
-) -> dict[str, Any]:
+def build_response(request: DecodedActionRequest, answer: Answer, policy: LoadedPolicy) -> dict[str, Any]:
     """The response's `action` or `actions`, its `probabilities`, and what is known from a search."""
-    actions = answer.actions.tolist()
+    output, actions = answer.output, answer.actions.tolist()
     response: dict[str, Any] = {"actions": actions} if request.is_batch else {"action": actions[0]}
-    if isinstance(answer, SearchedActions):
-        rows: dict[str, list[Any]] = {"simulations": answer.simulations()}
+    if isinstance(output, SearchedActions):
+        rows: dict[str, list[Any]] = {"simulations": output.simulations()}
         if request.options.analysis:
-            rows["analysis"] = answer.analyses()
+            rows["analysis"] = output.analyses()
         response |= rows if request.is_batch else {name: values[0] for name, values in rows.items()}
     if request.options.values:
         assert answer.dist_inputs is not None
         # An action that is certain has the probability 1 even if it is illegal.
-        mask = observations.get(ACTION_MASK) if policy.graph.has_distribution else None
+        mask = answer.inputs.get(ACTION_MASK) if policy.graph.has_distribution else None
         likely = probabilities(answer.dist_inputs, policy.manifest.action, mask)
         response["probabilities"] = likely if request.is_batch else likely[0]
     return response
-
-
-REPLICA = b"x-league-replica"

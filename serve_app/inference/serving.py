@@ -1,5 +1,6 @@
 """What all interfaces of inference of a replica share."""
 
+import asyncio
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,8 +8,9 @@ from dataclasses import dataclass, field
 from time import perf_counter_ns
 
 from league.errors import Overloaded
-from league.policies.policy import Actions, Arrays
+from league.policies.policy import Arrays
 from serve_app.access.access_control import AccessControl
+from serve_app.inference.batches import Answer, Batches, Observations, Run
 from serve_app.live_versions.alias_slots import AliasSlots
 from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.resolver import ModelResolver
@@ -34,6 +36,7 @@ class Serving:
     settings: ServeSettings
     in_flight: Counter[str] = field(default_factory=Counter)
     """api → requests in flight."""
+    batches: Batches = field(default_factory=Batches)
 
     def check_in_flight(self, api: str) -> None:
         """Raise Overloaded if as many requests of an interface are in flight as may be."""
@@ -51,21 +54,41 @@ class Serving:
             self.in_flight[api] -= 1
 
     async def act(
-        self, policy: LoadedPolicy, arrays: Arrays, options: ActionOptions, state: Arrays | None = None
-    ) -> Actions:
-        """Choose actions, and mirror the request. Arguments and errors are those of `LoadedPolicy.act`."""
-        answer = await policy.act(arrays, options, state)
-        self.mirror(policy, arrays, options, answer, state)
-        return answer
+        self, policy: LoadedPolicy, observations: Observations, options: ActionOptions, state: Arrays | None = None
+    ) -> Answer:
+        """Decode the observations of a request, choose actions, and mirror the request.
 
-    def mirror(
-        self, policy: LoadedPolicy, arrays: Arrays, options: ActionOptions, answer: Actions, state: Arrays | None = None
-    ) -> None:
-        """Mirror a request that a policy has answered, if it has a shadow."""
-        mirror = self.shadow.mirror_for(policy)
-        if mirror is not None:
-            observations = {port.name: arrays[port.name] for port in policy.observed}
-            mirror(observations, state, None if policy.is_sampled(options) else answer.actions)
+        Small requests without a seed and a state share a run with those of other connections; see `Batches`.
+
+        Args:
+            policy: The policy that acts.
+            observations: Those of the request. They may contain the recurrent state.
+            options: How actions are chosen.
+            state: The recurrent state; None at the start of episodes.
+
+        Raises:
+            LeagueError: See `LoadedPolicy.act`, and what reading the observations raises.
+        """
+        can_share = options.seed is None and not (policy.state or options.analysis)
+        is_small = observations.is_joinable and observations.rows <= policy.inline_rows
+        is_joint = can_share and is_small
+        answer = await Run(self.batches, policy, observations, options) if is_joint else None
+        if answer is None:
+            started = perf_counter_ns()
+            if observations.is_large:
+                inputs = await asyncio.to_thread(observations.read, policy, [observations])
+            else:
+                inputs = observations.read(policy, [observations])
+            if state is None:
+                state = {name: inputs[name] for name, _ in policy.state if name in inputs} or None
+            read = perf_counter_ns()
+            actions = await policy.act(inputs, options, state)
+            answer = Answer(actions, inputs, slice(None), started, read, perf_counter_ns())
+        if (mirror := self.shadow.mirror_for(policy)) is not None:
+            inputs = answer.inputs
+            greedy = None if policy.is_sampled(options) else answer.actions
+            mirror({port.name: inputs[port.name] for port in policy.observed}, state, greedy)
+        return answer
 
     def count(self, api: str, policy: LoadedPolicy, rows: int, begun: int) -> None:
         """Count an answered request. begun: a time of `perf_counter_ns`."""

@@ -8,7 +8,8 @@ With 16 bytes the first tensor is aligned in memory and can be used without a co
 """
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +17,11 @@ from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, InvalidInput, ObservationError
 from league.policies.onnx import ACTION
+from league.policies.policy import Arrays
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import check, check_mask
 from league.spaces.binary_leaves import little_endian
-from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
+from serve_app.live_versions.policies import ActionOptions, LoadedPolicy, Port
 
 FRAMING = 1
 REQUEST = struct.Struct("<BBHIQ")
@@ -39,30 +41,44 @@ class BinaryRequest(NamedTuple):
     tensors: memoryview
 
 
-def read_tensors(policy: LoadedPolicy, request: BinaryRequest) -> dict[str, NDArray]:
-    """Decode the graph's inputs, without state. Raises ObservationError or IllegalMask."""
+class BinaryObservations(NamedTuple):
+    """See `Observations`. parts: the bytes of each input, in the order of the manifest, without recurrent state."""
+
+    parts: Sequence[bytes | memoryview]
+    rows: int
+    is_joinable: bool = True
+    is_large: bool = False
+
+    @staticmethod
+    def read(policy: LoadedPolicy, parts: Sequence["BinaryObservations"]) -> Arrays:
+        """See `Observations`. Raises ObservationError or IllegalMask."""
+        inputs, rows = parts[0].parts, parts[0].rows
+        if len(parts) > 1:
+            inputs = [b"".join(inputs) for inputs in zip(*(part.parts for part in parts), strict=True)]
+            rows = sum(part.rows for part in parts)
+        arrays = {port.name: binary_array(port, data, rows) for port, data in zip(policy.observed, inputs, strict=True)}
+        if policy.is_masked:
+            check_mask(arrays[ACTION_MASK])
+        return arrays
+
+
+def binary_array(port: Port, data: bytes | memoryview, rows: int) -> NDArray:
+    """The array (rows, …) of an input of a graph from its bytes. Raises ObservationError."""
+    array = little_endian(port.name, data, port.dtype, port.datatype).reshape(rows, *port.leaf.shape)
+    return check(port.name, array, port.leaf)
+
+
+def observations_of(policy: LoadedPolicy, request: BinaryRequest) -> BinaryObservations:
+    """The observations of a request. Raises ObservationError."""
     if len(request.tensors) != (size := request.rows * sum(port.row_bytes for port in policy.observed)):
         parts = " + ".join(f"{port.row_bytes} {port.name}" for port in policy.observed)
         raise ObservationError(
             f"the tensors have {len(request.tensors)} bytes, expected {size}: {request.rows} rows of {parts}"
         )
-    tensors, at = list[memoryview](), 0
-    for port in policy.observed:
-        end = at + request.rows * port.row_bytes
-        tensors.append(request.tensors[at:end])
-        at = end
-    return observations_of(policy, tensors, request.rows)
-
-
-def observations_of(policy: LoadedPolicy, tensors: Iterable[bytes | memoryview], rows: int) -> dict[str, NDArray]:
-    """The graph's inputs, without state, from the bytes of each. Raises ObservationError or IllegalMask."""
-    arrays = {}
-    for port, data in zip(policy.observed, tensors, strict=True):
-        array = little_endian(port.name, data, port.dtype).reshape(rows, *port.leaf.shape)
-        arrays[port.name] = check(port.name, array, port.leaf)
-    if policy.is_masked:
-        check_mask(arrays[ACTION_MASK])
-    return arrays
+    ends = list(accumulate(request.rows * port.row_bytes for port in policy.observed))
+    return BinaryObservations(
+        [request.tensors[begin:end] for begin, end in zip([0, *ends], ends, strict=False)], request.rows
+    )
 
 
 def write_actions(policy: LoadedPolicy, actions: NDArray) -> bytes:

@@ -14,7 +14,7 @@ import orjson
 from numpy.typing import NDArray
 
 from league.errors import InvalidInput, InvalidState, LeagueError, RateLimited, Unauthenticated
-from league.policies.policy import Actions
+from league.policies.policy import Arrays
 from league.refs import CHAMPION
 from league.spaces.observation_codec import json_type
 from serve_app.access.access_control import POLICY_VIOLATION
@@ -22,23 +22,21 @@ from serve_app.access.api_keys import ApiKey
 from serve_app.access.errors import MalformedBody, status_of
 from serve_app.access.request_body import parse_json_object
 from serve_app.codecs.request_limits import LARGE_BODY
+from serve_app.inference import stream_codec
 from serve_app.inference.action_request import (
     KEYS,
-    Arrays,
     DecodedActionRequest,
     build_response,
     decode_state,
     encode_state,
-    is_plain,
+    observations_of,
     parse_action_request,
     parse_flag,
     pinned_version,
-    read_observations,
     reject_unknown_keys,
 )
 from serve_app.inference.serving import Serving
-from serve_app.inference.stream_batches import StreamBatches
-from serve_app.inference.stream_codec import parse_request, read_tensors, write_actions
+from serve_app.inference.stream_codec import parse_request, write_actions
 from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.resolver import policy_ref
 from serve_app.live_versions.traffic_split import Headers, acting
@@ -57,8 +55,7 @@ class StreamSession:
     """The session of one connection; messages are passed in one at a time.
 
     follows: the alias to follow; None pins the version of `policy`. headers: those of the handshake; the caller's key
-    may route a stream that follows the champion to the canary, and selects the member of a mixture. batches: of all
-    streams, if the connection can wait for them.
+    may route a stream that follows the champion to the canary, and selects the member of a mixture.
     """
 
     def __init__(
@@ -69,7 +66,6 @@ class StreamSession:
         follows: str | None,
         headers: Headers,
         key: ApiKey | None,
-        batches: StreamBatches | None = None,
     ) -> None:
         self._serving = serving
         self._model = model
@@ -78,9 +74,8 @@ class StreamSession:
         self._follows = follows
         self._headers = headers
         self._key = key
-        self._batches = batches
         self._policy = policy
-        self._state: Arrays | None = None
+        self._state: dict[str, NDArray] | None = None
         """Recurrent state, one row per observation of the last message; None at the start of episodes."""
         self._is_batch = False
 
@@ -130,28 +125,23 @@ class StreamSession:
             raise InvalidState("state is an object, expected a token: streams do not accept arrays")
         is_anew = reset is True or ("state" in document and document["state"] is None)
         policy, state = await self._select(request, is_anew, _resets(reset, request))
-        plain = is_plain(request, policy, data.count(b'"') - 2 * len(stream_keys))
-        observations = await read_observations(request, policy, plain, len(data))
+        observations = observations_of(request, policy, data, len(stream_keys))
         answer = await self._serving.act(policy, observations, request.options, state)
-        self._store_state(policy, answer, request.is_batch)
-        response = build_response(request, answer, observations, policy)
+        self._policy, self._state, self._is_batch = policy, answer.output.state, request.is_batch
+        response = build_response(request, answer, policy)
         if return_state and self._state is not None:
             response["state"] = self._tokens()
         message = self._signed(response)
-        self._serving.count(API, policy, len(request.observations), start)
+        self._serving.count(API, policy, observations.rows, start)
         return message
 
     async def _answer_binary(self, data: bytes) -> StreamMessage:
         start = perf_counter_ns()
         request = parse_request(data, self._serving.settings.max_batch)
         policy, state = self._continue(request.rows, request.reset, request.resets)
-        observations = read_tensors(policy, request)
-        if self._batches is not None and request.options.seed is None and not policy.state:
-            answer = await self._batches.act(policy, observations, request.rows, request.options)
-            self._serving.mirror(policy, observations, request.options, answer)
-        else:
-            answer = await self._serving.act(policy, observations, request.options, state)
-        self._store_state(policy, answer, is_batch=request.rows > 1)
+        observations = stream_codec.observations_of(policy, request)
+        answer = await self._serving.act(policy, observations, request.options, state)
+        self._policy, self._state, self._is_batch = policy, answer.output.state, request.rows > 1
         message = StreamMessage(write_actions(policy, answer.actions), False)
         self._serving.count(API, policy, request.rows, start)
         return message
@@ -202,9 +192,6 @@ class StreamSession:
                 return self._policy
             version = acting(version, self._headers)
         return version.policy(self._ref.policy)
-
-    def _store_state(self, policy: LoadedPolicy, answer: Actions, is_batch: bool) -> None:
-        self._policy, self._state, self._is_batch = policy, answer.state, is_batch
 
     def _tokens(self) -> str | list[str]:
         assert self._state is not None

@@ -1,8 +1,9 @@
 """The Open Inference Protocol over gRPC: messages to requests and back, and the service that answers them."""
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from ipaddress import IPv6Address, ip_address
-from typing import Any
+from time import perf_counter_ns
+from typing import Any, cast
 from urllib.parse import unquote
 
 import grpc
@@ -17,7 +18,7 @@ from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference_protocol import open_inference_pb2 as messages
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.field_count import check_fields, malformed
-from serve_app.inference_protocol.inference import API, Inference, InferRequest, InferResponse
+from serve_app.inference_protocol.inference import API, Inference, InferRequest, Outputs
 from serve_app.inference_protocol.rest_codec import SEQUENCE, UNSUPPORTED
 from serve_app.inference_protocol.statistics import Document
 from serve_app.inference_protocol.tensors import Data, RequestTensor, datatype_of, to_bytes
@@ -68,8 +69,6 @@ def read_request(request: messages.ModelInferRequest, size: int) -> InferRequest
         raise InvalidInput(f"{len(raw_inputs)} raw_input_contents for {len(request.inputs)} inputs, expected one each")
     sequence = request.parameters.get(SEQUENCE)
     return InferRequest(
-        model=request.model_name,
-        version=request.model_version,
         id=request.id,
         inputs=[_tensor(tensor, raw_inputs[i] if raw_inputs else None) for i, tensor in enumerate(request.inputs)],
         outputs=[output.name for output in request.outputs],
@@ -91,13 +90,12 @@ def _tensor(tensor: messages.ModelInferRequest.InferInputTensor, contents: bytes
     return RequestTensor(tensor.name, tensor.datatype, tensor.shape, data)
 
 
-def write_response(response: InferResponse) -> messages.ModelInferResponse:
+def write_response(request: messages.ModelInferRequest, version: int, outputs: Outputs) -> messages.ModelInferResponse:
     """Convert a response to a message, with all outputs as bytes."""
-    outputs = response.outputs
     return messages.ModelInferResponse(
-        model_name=response.model,
-        model_version=response.version,
-        id=response.id,
+        model_name=request.model_name,
+        model_version=str(version),
+        id=request.id,
         outputs=[
             messages.ModelInferResponse.InferOutputTensor(name=name, datatype=datatype_of(array), shape=array.shape)
             for name, array in outputs.items()
@@ -163,15 +161,16 @@ class InferenceService:
                 body = await self._read(context, self._settings.max_body if rpc == INFER else MAX_CHANGE_BODY)
                 if len(body) > LARGE_BODY:
                     self._access.admit_body(key, len(body))
-                request: Any = parse(body, request_type)
+                begun, request = perf_counter_ns(), cast(Any, parse(body, request_type))
                 model = request.model_name if rpc == INFER else getattr(request, "name", "")
                 self._access.check_model(key, rpc, model)
                 if rpc != INFER:
                     return await self._answer(rpc, request)
-                headers = headers_of(metadata)
+                policy = await self._inference.find(model, request.model_version, headers_of(metadata))
                 if max(len(request.inputs), len(request.outputs), len(request.raw_input_contents)) > FEW_TENSORS:
-                    check_counts(request, await self._inference.find(model, request.model_version, headers))
-                return await self._inference.infer(read_request(request, len(body)), write_response, headers)
+                    check_counts(request, policy)
+                write = partial(write_response, request, policy.number)
+                return await self._inference.infer(policy, read_request(request, len(body)), write, begun)
         except LeagueError as error:
             self._inference.serving.metrics.count_error(f"/v2/models/{model}", error.code)
             raise

@@ -5,28 +5,29 @@ sums over all replicas. Errors are `{"error": "…"}`.
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
+from weakref import WeakKeyDictionary
 
 from starlette.requests import Request
 from starlette.types import Receive, Scope, Send
 
 from league.errors import InvalidInput, NotReady
-from serve_app.access.access_control import KEY
-from serve_app.access.access_log import LOG_ENTRY, log_version
 from serve_app.access.request_body import MAX_CHANGE_BODY, parse_json_object, read_bytes
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.declaration import CALLER, REPLICA_HEADER, TIMEOUT, Declaration, Parameter
-from serve_app.inference.action_request import REPLICA
+from serve_app.inference.http_route import JSON, HttpRoute, Reply, ResponseHeaders
+from serve_app.inference.stream_codec import BinaryObservations
 from serve_app.inference_protocol.catalogue import ModelCatalogue
-from serve_app.inference_protocol.inference import API, Inference, InferResponse
-from serve_app.inference_protocol.rest_codec import compressed, read_request, write_response
+from serve_app.inference_protocol.inference import API, Inference, Outputs
+from serve_app.inference_protocol.rest_codec import RestRequest, compressed, read_request, write_response
+from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.registry_watcher import RegistryWatcher
 from serve_app.live_versions.traffic_split import Headers
 
-JSON, BINARY = b"application/json", b"application/octet-stream"
-BODIES = (JSON.decode(), BINARY.decode())
+BINARY = b"application/octet-stream"
+BODIES = ("application/json", BINARY.decode())
 HEADER_LENGTH = b"inference-header-content-length"
 LENGTH_DIGITS = 10
 """Maximum digits of a length header."""
@@ -186,13 +187,34 @@ class RestRoutes:
         return await self._catalogue.config(model, version)
 
 
-class InferRoute:
-    """POST …/infer as a plain ASGI application: the hot path."""
+MAX_HEAD = 1024
+"""Bytes of the longest JSON that is kept."""
+MAX_HEADS = 64
+"""JSON texts that are kept for a policy: callers can send any."""
+
+
+class Layout(NamedTuple):
+    """What the JSON of a valid request says if all its inputs are binary. size: of the body."""
+
+    request: RestRequest
+    tensors: Sequence[slice]
+    """Place of each input of the policy in the body."""
+    size: int
+    rows: int
+
+
+class InferRoute(HttpRoute):
+    """POST …/infer: the hot path.
+
+    A caller sends nearly the same JSON before the tensors of each request. What it says is parsed and checked once.
+    """
+
+    api = API
 
     def __init__(self, inference: Inference, replica: str) -> None:
+        super().__init__(inference.serving, replica)
         self._inference = inference
-        self._serving = inference.serving
-        self._replica = (REPLICA, replica.encode())
+        self._layouts: WeakKeyDictionary[LoadedPolicy, dict[bytes, Layout]] = WeakKeyDictionary()
 
     @of_model_and_version(
         Declaration(
@@ -238,40 +260,50 @@ class InferRoute:
         the JSON part. Request (`Content-Encoding: gzip` or `deflate`) and response (`Accept-Encoding`) can be
         compressed.
         """
-        with self._serving.admitted(API):
-            await self._handle(scope, receive, send)
+        await self.respond(scope, receive, send, scope["path_params"].get("version", ""))
 
-    async def _handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        header_length, accepted = framing(scope["headers"])
-        turn = self._serving.access.backlog.turn
-        body = await read_bytes(scope, receive, self._serving.settings.max_body)
-        if (is_large := len(body) > LARGE_BODY) or turn != self._serving.access.backlog.turn:
-            self._serving.access.admit_body(scope.get(KEY), len(body))
-        model, version = scope["path_params"]["model"], scope["path_params"].get("version", "")
-        if is_large:
-            policy = await self._inference.find(model, version)
-            policy.limits.check_body(memoryview(body)[:header_length], self._serving.settings.max_batch)
-            request = await asyncio.to_thread(read_request, model, version, body, header_length)
+    async def answer(self, model: str, version: str, headers: Headers, body: bytes, begun: int) -> Reply:
+        """See `HttpRoute`."""
+        header_length, accepted = framing(headers)
+        policy = await self._inference.find(model, version, headers)
+        head = body[:header_length] if header_length is not None and header_length <= MAX_HEAD else b""
+        layout, inputs = self._layouts.get(policy, {}).get(head), None
+        if layout is not None and len(body) == layout.size:
+            request, inputs = layout.request, BinaryObservations([body[part] for part in layout.tensors], layout.rows)
+        elif len(body) > LARGE_BODY:
+            policy.limits.check_body(memoryview(body)[:header_length], self.serving.settings.max_batch)
+            request = await asyncio.to_thread(read_request, body, header_length)
         else:
-            request = read_request(model, version, body, header_length)
+            request = read_request(body, header_length)
 
-        def write(response: InferResponse) -> tuple[bytes, int | None]:
-            if LOG_ENTRY in scope:
-                log_version(scope, response.model, int(response.version))
-            return write_response(response, request)
+        def write(outputs: Outputs) -> tuple[bytes, int | None]:
+            return write_response(model, policy.number, outputs, request)
 
-        response, length = await self._inference.infer(request.infer, write, scope["headers"])
-        headers = [(b"content-type", JSON if length is None else BINARY)]
-        if length is not None:
-            headers.append((HEADER_LENGTH, b"%d" % length))
+        content, length = await self._inference.infer(policy, request.infer, write, begun, inputs)
+        if head and inputs is None and len(body) <= LARGE_BODY:
+            self._keep(policy, head, request)
+        lines: ResponseHeaders = (
+            JSON if length is None else ((b"content-type", BINARY), (HEADER_LENGTH, b"%d" % length))
+        )
         if accepted:
-            response, encoding = await compressed(response, accepted)
-            headers.append((b"vary", b"accept-encoding"))
+            content, encoding = await compressed(content, accepted)
+            lines += ((b"vary", b"accept-encoding"),)
             if encoding is not None:
-                headers.append((b"content-encoding", encoding))
-        headers += [(b"content-length", b"%d" % len(response)), self._replica]
-        await send({"type": "http.response.start", "status": 200, "headers": headers})
-        await send({"type": "http.response.body", "body": response})
+                lines += ((b"content-encoding", encoding),)
+        return Reply(policy.number, content, lines)
+
+    def _keep(self, policy: LoadedPolicy, head: bytes, request: RestRequest) -> None:
+        """Keep what the JSON of a valid request says, if all its inputs are binary."""
+        tensors, end = {}, len(head)
+        for tensor in request.infer.inputs:
+            tensors[tensor.name] = slice(end, end := end + len(tensor.data))
+        if all(isinstance(tensor.data, memoryview) for tensor in request.infer.inputs) and not policy.state:
+            layouts = self._layouts.setdefault(policy, {})
+            if len(layouts) == MAX_HEADS:
+                layouts.clear()
+            rows = request.infer.inputs[0].shape[0]
+            request = request._replace(infer=request.infer._replace(inputs=()))  # which refer to the body
+            layouts[head] = Layout(request, [tensors[port.name] for port in policy.observed], end, rows)
 
 
 def framing(headers: Headers) -> tuple[int | None, bytes]:

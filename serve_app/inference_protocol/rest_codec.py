@@ -18,7 +18,7 @@ from league.errors import InvalidInput
 from league.spaces.observation_codec import json_type
 from serve_app.access.errors import MalformedBody
 from serve_app.access.request_body import WINDOW_BITS, parse_json_object
-from serve_app.inference_protocol.inference import InferRequest, InferResponse
+from serve_app.inference_protocol.inference import InferRequest, Outputs
 from serve_app.inference_protocol.tensors import RequestTensor, datatype_of, to_bytes
 
 LEVEL = 1
@@ -55,7 +55,7 @@ class RestRequest(NamedTuple):
     binary: dict[str, bool]
 
 
-def read_request(model: str, version: str, body: bytes, header_length: int | None) -> RestRequest:
+def read_request(body: bytes, header_length: int | None) -> RestRequest:
     """Decode a body; `header_length` is the length of its JSON, None if it is all JSON.
 
     Raises MalformedBody or InvalidInput.
@@ -74,8 +74,6 @@ def read_request(model: str, version: str, body: bytes, header_length: int | Non
         if output_parameters.get("binary_data") is not None:
             binary[name] = _flag(output_parameters, "binary_data")
     request = InferRequest(
-        model=model,
-        version=version,
         id="" if document.get("id") is None else _string(document, "id", "the request"),
         inputs=_tensors(_list(document, "inputs", required=True), tensor_bytes),
         outputs=names,
@@ -86,10 +84,10 @@ def read_request(model: str, version: str, body: bytes, header_length: int | Non
     return RestRequest(request, is_binary, binary)
 
 
-def write_response(response: InferResponse, request: RestRequest) -> tuple[bytes, int | None]:
+def write_response(model: str, version: int, arrays: Outputs, request: RestRequest) -> tuple[bytes, int | None]:
     """Encode a response; returns the body, and the length of its JSON if binary data follows."""
     outputs, parts = [], []
-    for name, array in response.outputs.items():
+    for name, array in arrays.items():
         output: dict[str, Any] = {"name": name, "datatype": datatype_of(array), "shape": array.shape}
         if request.binary.get(name, request.is_binary):
             parts.append(to_bytes(array))
@@ -97,9 +95,9 @@ def write_response(response: InferResponse, request: RestRequest) -> tuple[bytes
         else:
             output["data"] = np.ascontiguousarray(array).reshape(-1)
         outputs.append(output)
-    document: dict[str, Any] = {"model_name": response.model, "model_version": response.version}
-    if response.id:
-        document["id"] = response.id
+    document: dict[str, Any] = {"model_name": model, "model_version": str(version)}
+    if request.infer.id:
+        document["id"] = request.infer.id
     head = orjson.dumps(document | {"outputs": outputs}, option=DUMP)
     return (b"".join((head, *parts)), len(head)) if parts else (head, None)
 

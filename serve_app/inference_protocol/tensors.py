@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from league.errors import BodyTooLarge, ObservationError
 from league.policies.open_inference import DATATYPES
+from league.policies.policy import Arrays
 from league.spaces import ACTION_MASK
 from league.spaces.arrays import check, check_mask
-from league.spaces.binary_leaves import little_endian
+from serve_app.inference.stream_codec import BinaryObservations, binary_array
 from serve_app.live_versions.policies import LoadedPolicy, Port
 
 _BY_DTYPE = {
@@ -53,36 +54,59 @@ Data = Sequence[Any] | bytes | memoryview
 """Elements in row-major order: lists, flat or nested, or little-endian bytes."""
 
 
-def read_inputs(tensors: Sequence[RequestTensor], policy: LoadedPolicy, max_batch: int) -> dict[str, NDArray]:
-    """Check the inputs of a request; input name → array (k, …), without the recurrent state if it is omitted.
+class Inputs(NamedTuple):
+    """The inputs of a request, which are not binary or large. See `Observations`."""
 
-    Raises ObservationError, IllegalMask, or BodyTooLarge for more than `max_batch` rows.
+    tensors: Sequence[RequestTensor]
+    rows: int
+    is_large: bool
+    is_joinable: bool = False
+
+    @staticmethod
+    def read(policy: LoadedPolicy, parts: Sequence["Inputs"]) -> Arrays:
+        """See `Observations`. Raises ObservationError or IllegalMask."""
+        (part,) = parts
+        arrays = {tensor.name: _array(tensor, policy.inputs[tensor.name]) for tensor in part.tensors}
+        if policy.is_masked:
+            check_mask(arrays[ACTION_MASK])
+        return arrays
+
+
+def checked_inputs(
+    tensors: Sequence[RequestTensor], policy: LoadedPolicy, max_batch: int, is_large: bool
+) -> Inputs | BinaryObservations:
+    """The inputs of a request, if their names, datatypes, shapes and sizes are those of a policy.
+
+    Raises ObservationError, or BodyTooLarge for more than `max_batch` rows.
     """
-    arrays: dict[str, NDArray] = {}
+    data: dict[str, Data] = {}
     for tensor in tensors:
         port = policy.inputs.get(tensor.name)
         if port is None:
             input_names = ", ".join(policy.inputs)
             raise ObservationError(f"unknown input {tensor.name[:64]!r}, expected {input_names}")
-        if tensor.name in arrays:
+        if tensor.name in data:
             raise ObservationError(f"input {tensor.name} is given twice")
-        arrays[tensor.name] = _array(tensor, port, max_batch)
+        _check_layout(tensor, port, max_batch)
+        data[tensor.name] = tensor.data
     # All inputs, or all but the state, must be there.
-    if len(arrays) < len(policy.inputs):
-        has_state = any(port.is_state and name in arrays for name, port in policy.inputs.items())
+    if len(data) < len(policy.inputs):
+        has_state = any(port.is_state and name in data for name, port in policy.inputs.items())
         for name, port in policy.inputs.items():
-            if name not in arrays and (has_state or not port.is_state):
+            if name not in data and (has_state or not port.is_state):
                 raise ObservationError(f"input {name} is missing")
-    rows = {len(array) for array in arrays.values()}
-    if len(rows) > 1:
-        sizes = ", ".join(f"{name} has {len(array)}" for name, array in arrays.items())
+    rows = tensors[0].shape[0]
+    if any(tensor.shape[0] != rows for tensor in tensors):
+        sizes = ", ".join(f"{tensor.name} has {tensor.shape[0]}" for tensor in tensors)
         raise ObservationError(f"the inputs have different numbers of rows: {sizes}")
-    if policy.is_masked:
-        check_mask(arrays[ACTION_MASK])
-    return arrays
+    observed = [data[port.name] for port in policy.observed]
+    parts = [part for part in observed if isinstance(part, bytes | memoryview)]
+    if is_large or len(parts) < len(data):
+        return Inputs(tensors, rows, is_large)
+    return BinaryObservations(parts, rows)
 
 
-def _array(tensor: RequestTensor, port: Port, max_batch: int) -> NDArray:
+def _check_layout(tensor: RequestTensor, port: Port, max_batch: int) -> None:
     if tensor.datatype != port.datatype:
         raise ObservationError(f"{port.name} has datatype {str(tensor.datatype)[:64]}, expected {port.datatype}")
     shape = tuple(tensor.shape)
@@ -91,14 +115,17 @@ def _array(tensor: RequestTensor, port: Port, max_batch: int) -> NDArray:
         raise ObservationError(f"{port.name} has shape {_list(shape[:16])}, expected {_list(expected)}")
     if shape[0] > max_batch:
         raise BodyTooLarge(f"{port.name} has {shape[0]} rows, expected at most {max_batch}")
-    if isinstance(tensor.data, bytes | memoryview):
-        if len(tensor.data) != (size := shape[0] * port.row_bytes):
-            raise ObservationError(
-                f"{port.name} has {len(tensor.data)} bytes, expected {size} for {_list(shape)} {port.datatype}"
-            )
-        return check(port.name, little_endian(port.name, tensor.data, port.dtype, "BOOL").reshape(shape), port.leaf)
-    read = _from_list if isinstance(tensor.data, list) else _from_field
-    return check(port.name, read(tensor.data, shape, port), port.leaf)
+    if isinstance(tensor.data, bytes | memoryview) and len(tensor.data) != (size := shape[0] * port.row_bytes):
+        raise ObservationError(
+            f"{port.name} has {len(tensor.data)} bytes, expected {size} for {_list(shape)} {port.datatype}"
+        )
+
+
+def _array(tensor: RequestTensor, port: Port) -> NDArray:
+    shape, data = tuple(tensor.shape), tensor.data
+    if isinstance(data, bytes | memoryview):
+        return binary_array(port, data, shape[0])
+    return check(port.name, (_from_list if isinstance(data, list) else _from_field)(data, shape, port), port.leaf)
 
 
 def _from_field(data: Sequence[Any], shape: tuple[int, ...], port: Port) -> NDArray:

@@ -25,9 +25,8 @@ from serve_app.access.access_control import KEY, POLICY_VIOLATION, SUBPROTOCOL
 from serve_app.access.api_keys import ApiKey
 from serve_app.access.connection_limit import ConnectionLimit, within_descriptors
 from serve_app.declaration import ALIAS, CALLER, REPLICA_HEADER, VERSION, Declaration, Parameter
-from serve_app.inference.action_request import REPLICA
+from serve_app.inference.http_route import REPLICA
 from serve_app.inference.serving import Serving
-from serve_app.inference.stream_batches import StreamBatches
 from serve_app.inference.stream_session import StreamSession
 from serve_app.live_versions.resolver import policy_ref, version_of
 from serve_app.routes.query_string import query_params
@@ -97,7 +96,6 @@ class StreamRoute:
                 limit,
             )
         self.connections = ConnectionLimit("streams", limit, settings.max_streams_per_key)
-        self._batches = StreamBatches()
         self._accepted: set[OpenStream] = set()
         self._closings: dict[OpenStream, asyncio.TimerHandle] = {}
         self._replicas: int | None = None
@@ -214,16 +212,7 @@ class StreamRoute:
             members = () if named is None else named.members
             policy = next((member.policy(ref.policy) for member in members if member.number == number), policy)
         headers = {b"x-league-version": str(policy.number), b"x-league-sha256": policy.sha256, REPLICA: self._replica}
-        can_wait = STREAM_PROTOCOL in scope.get("extensions", {})
-        stream = StreamSession(
-            self._serving,
-            model,
-            policy,
-            follows,
-            scope["headers"],
-            scope.get(KEY),
-            self._batches if can_wait else None,
-        )
+        stream = StreamSession(self._serving, model, policy, follows, scope["headers"], scope.get(KEY))
         return stream, [(name, value.encode()) for name, value in headers.items()]
 
     async def _exchange_messages(self, stream: StreamSession, opened: OpenStream, receive: Receive) -> None:

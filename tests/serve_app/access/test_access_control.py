@@ -18,7 +18,6 @@ from unittest.mock import AsyncMock, Mock
 
 import httpx
 import pytest
-from starlette.applications import Starlette
 from starlette.routing import Route, WebSocketRoute
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.types import Message
@@ -359,7 +358,6 @@ def test_each_request_is_a_line(registry: Registry, log: Path) -> None:
 def test_a_bug_is_answered_logged_counted_and_raised(
     registry: Registry, log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In requests that the routing table distributes, and in those that go to their route without it."""
     _, token = registry.keys.create("player", ["act", "read"])
     headers = bearer(token) | {"origin": GAME}
     settings = LOGGING_SETTINGS.model_copy(update={"cors_origins": [GAME]})
@@ -412,10 +410,8 @@ EXPECTED = {
 
 
 def answer(error: Exception) -> tuple[int, dict[str, str], dict[str, str]]:
-    handlers = ErrorHandlers(retry=3, count=lambda *_: None).handlers()
-    app = Starlette(routes=[Route("/", AsyncMock(side_effect=error))], exception_handlers=handlers)
-    reply = TestClient(app, raise_server_exceptions=False).get("/")
-    return reply.status_code, reply.json(), dict(reply.headers)
+    reply = ErrorHandlers(retry=3, count=lambda *_: None).response("/", error)
+    return reply.status_code, json.loads(reply.body), dict(reply.headers)
 
 
 def test_an_error_has_the_status_of_its_class(subtests: pytest.Subtests) -> None:
@@ -432,8 +428,8 @@ def test_paths_hosts_and_unexpected_exceptions_are_only_logged() -> None:
     error = StorageError("the database postgresql://admin@db.internal/league cannot be used: no route to host")
     message = "the registry's database or files cannot be used; see the server log"
     assert answer(error)[1] == {"code": "storage_error", "message": message}
-    reply = ErrorHandlers(retry=3, count=lambda *_: None).internal_error("/", ZeroDivisionError("secret"))
-    assert (reply.status_code, b"internal_error" in reply.body, b"secret" in reply.body) == (500, True, False)
+    status, body, _ = answer(ZeroDivisionError("secret"))
+    assert (status, body["code"], "secret" in body["message"]) == (500, "internal_error", False)
 
 
 PERMISSIONS = Permissions(ROUTES)

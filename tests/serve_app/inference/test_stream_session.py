@@ -1,8 +1,6 @@
 """Messages of a stream: their encoding, their answers, the state between them, and the version that answers."""
 
-import asyncio
 import shutil
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from functools import partial
 from typing import Any
@@ -17,9 +15,9 @@ from hypothesis.extra.numpy import from_dtype
 from starlette.testclient import TestClient, WebSocketDenialResponse, WebSocketTestSession
 from starlette.websockets import WebSocketDisconnect
 
-from league.errors import GraphTimeout, LeagueError, ObservationError, Overloaded
+from league.errors import LeagueError, ObservationError, Overloaded
 from league.policies.onnx import OnnxPolicy
-from league.policies.policy import Actions
+from league.policies.policy import Arrays
 from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
@@ -28,15 +26,14 @@ from league.settings import Storage
 from serve_app.access import api_keys
 from serve_app.access.api_keys import TokenBucket
 from serve_app.access.load_shedding import Backlog
-from serve_app.inference.action_request import Arrays
-from serve_app.inference.stream_batches import StreamBatches
 from serve_app.inference.stream_codec import (
     HAS_RESETS,
     REQUEST,
     RESPONSE,
+    BinaryRequest,
     encode_request,
+    observations_of,
     parse_request,
-    read_tensors,
     write_actions,
 )
 from serve_app.live_versions.policies import ActionOptions, ActionSelections, LoadedPolicy
@@ -463,6 +460,11 @@ def request_data(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
+def decode(policy: LoadedPolicy, request: BinaryRequest) -> Arrays:
+    observations = observations_of(policy, request)
+    return observations.read(policy, [observations])
+
+
 @examples(50)
 @given(data=request_data(), has_resets=st.booleans())
 def test_requests_survive_encoding(policies: dict[str, LoadedPolicy], data: dict[str, Any], has_resets: bool) -> None:
@@ -477,7 +479,7 @@ def test_requests_survive_encoding(policies: dict[str, LoadedPolicy], data: dict
     assert read.options == ActionOptions(data["explore"], data["seed"])
     assert (read.rows, read.reset) == (data["rows"], data["reset"])
     assert (read.resets is not None) == has_resets
-    decoded = read_tensors(policies["kinds"], read)
+    decoded = decode(policies["kinds"], read)
     assert list(decoded) == names
     for name, tensor in zip(names, tensors, strict=True):
         np.testing.assert_array_equal(decoded[name], tensor)
@@ -494,7 +496,7 @@ def test_resets_are_parsed(policies: dict[str, LoadedPolicy], resets: list[bool]
     read = parse_request(message, MAX_ROWS)
     assert read.resets is not None
     assert read.resets.tolist() == resets
-    np.testing.assert_array_equal(read_tensors(policies["memory"], read)["observation"], observation)
+    np.testing.assert_array_equal(decode(policies["memory"], read)["observation"], observation)
 
 
 @examples(50)
@@ -518,99 +520,7 @@ def test_a_header_has_the_documented_layout() -> None:
 
 def test_bytes_of_a_boolean_are_0_and_1(policies: dict[str, LoadedPolicy]) -> None:
     planes, mask = np.zeros((1, 8, 8, 111), np.uint8), np.ones((1, 4672), np.int8)
-    read_tensors(policies["chess"], parse_request(encode_request([planes, mask], 1), MAX_ROWS))
+    decode(policies["chess"], parse_request(encode_request([planes, mask], 1), MAX_ROWS))
     planes[0, 3, 3, 3] = 2
     with pytest.raises(ObservationError, match="other than 0 and 1"):
-        read_tensors(policies["chess"], parse_request(encode_request([planes, mask], 1), MAX_ROWS))
-
-
-@pytest.fixture
-def policy(storage: Storage) -> Iterator[LoadedPolicy]:
-    """A policy of its own: a run that is too slow changes it."""
-    registry = Registry.open(storage)
-    policy = load(registry, "board", 1, 0.0, ActionSelections()).policy("shared")
-    policy.inline_rows = 64  # however fast the machine is
-    policy.inline_graph = policy.graph.within(60.0)
-    yield policy
-    registry.close()
-
-
-@pytest.fixture
-def batches(policy: LoadedPolicy, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The number of rows of each of its runs."""
-    rows = list[int]()
-    act = policy.inline_graph.act
-
-    def counted(observations: Arrays, **options: Any) -> Actions:
-        rows.append(len(observations["action_mask"]))
-        return act(observations, **options)
-
-    monkeypatch.setattr(policy.inline_graph, "act", counted)
-    return rows
-
-
-async def together(policy: LoadedPolicy, messages: list[Arrays], explore: bool = False) -> list[Any]:
-    """What messages of one turn are answered, as the protocol of their connections awaits it."""
-    waiting, outcomes, loop = StreamBatches(), [None] * len(messages), asyncio.get_running_loop()
-    for index, observations in enumerate(messages):
-        rows = len(observations["action_mask"])
-        steps = waiting.act(policy, observations, rows, ActionOptions(explore)).__await__()
-
-        def go_on(outcome: Any, steps: Any = steps, index: int = index) -> None:
-            try:
-                steps.throw(outcome) if isinstance(outcome, Exception) else steps.send(outcome)
-                outcomes[index] = "awaits a thread"
-            except StopIteration as done:
-                outcomes[index] = done.value.actions.tolist()
-            except Exception as error:
-                outcomes[index] = error
-
-        steps.send(None).later(loop, go_on)
-    await asyncio.sleep(0)
-    assert None not in outcomes
-    return outcomes
-
-
-def test_messages_of_one_turn_are_one_batch(policy: LoadedPolicy, batches: list[int]) -> None:
-    messages = [board_arrays(boards(8)[:rows]) for rows in (1, 3, 8, 1)]
-    expected = [policy.inline_graph.act(message).actions.tolist() for message in messages]
-    batches.clear()
-    assert asyncio.run(together(policy, messages)) == expected
-    assert batches == [13]
-    assert len({action for actions in expected for action in actions}) > 1
-
-
-def test_a_batch_has_at_most_the_rows_of_the_event_loop(policy: LoadedPolicy, batches: list[int]) -> None:
-    policy.inline_rows = 4
-    messages = [board_arrays(boards(8)[:rows]) for rows in (3, 2, 2, 4, 1)]
-    asyncio.run(together(policy, messages))
-    assert batches == [3, 4, 4, 1]
-
-
-def test_sampled_actions_are_drawn_for_each_row(policy: LoadedPolicy, batches: list[int]) -> None:
-    one = board_arrays([BOARD])
-    actions = asyncio.run(together(policy, [one] * 100, explore=True))
-    assert batches == [64, 36]
-    assert len({action for (action,) in actions}) > 1
-    assert all(BOARD["action_mask"][action] for (action,) in actions)
-
-
-def test_an_error_is_that_of_its_message(policy: LoadedPolicy, batches: list[int]) -> None:
-    one = board_arrays([BOARD])
-    expected = policy.inline_graph.act(one).actions.tolist()
-    wrong = one | {"observation": one["observation"].astype(np.float32)}
-    first, second, third = asyncio.run(together(policy, [one, wrong, one]))
-    assert first == third == expected
-    assert isinstance(second, ObservationError)
-
-
-def test_messages_of_a_slow_policy_run_in_threads(policy: LoadedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run_out_of_time(*_: Any, **__: Any) -> None:
-        monkeypatch.undo()
-        raise GraphTimeout("too slow")
-
-    monkeypatch.setattr(policy.inline_graph, "act", run_out_of_time)
-    assert asyncio.run(together(policy, [board_arrays([BOARD])] * 100)) == ["awaits a thread"] * 100, (
-        "of later batches, too"
-    )
-    assert policy.inline_rows == 0
+        decode(policies["chess"], parse_request(encode_request([planes, mask], 1), MAX_ROWS))

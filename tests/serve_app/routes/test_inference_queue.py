@@ -1,8 +1,8 @@
-"""The fast path of the action route answers as the application does."""
+"""Requests for inference that arrive with their body are answered as the application answers them."""
 
 import asyncio
 import gc
-import random
+import json
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +18,9 @@ from league.registry.storage.rows import Portion
 from league.settings import Storage
 from serve_app.access.load_shedding import Backlog
 from serve_app.app import Replica
-from serve_app.routes import plain_action
-from serve_app.routes.plain_action import PlainActions
+from serve_app.live_versions.policies import LoadedPolicy
+from serve_app.routes import inference_queue
+from serve_app.routes.inference_queue import InferenceQueue
 from serve_app.runtime.uvicorn_http import HttpProtocol
 from tests.support.clients.actions import BOARD, INVALID, boards
 from tests.support.leagues.served_leagues import everything, promote
@@ -29,7 +30,6 @@ from tests.support.servers.two_paths import (
     Connections,
     binary_boards,
     changing,
-    differences,
     exchange,
     infer,
     receive,
@@ -120,6 +120,7 @@ OTHERS: dict[str, bytes] = {  # besides those that are generated
     "binary, illegal": infer({**binary_boards(1), "action_mask": np.zeros((1, 7), np.int8)}),
     "binary, an input is missing": infer({"observation": binary_boards(1)["observation"]}),
     "binary, unequal rows": infer(binary_boards(2) | {"action_mask": np.ones((1, 7), np.int8)}),
+    "binary, a version that is not in memory": infer(binary_boards(1), "board/versions/2"),
     "binary, an unknown version": infer(binary_boards(1), "board/versions/9"),
     "binary, no version": infer(binary_boards(1), "board/versions/"),
     "binary, an encoding": infer(binary_boards(1), more={"Content-Encoding": "gzip"}),
@@ -134,56 +135,63 @@ def test_other_requests_get_the_same_answer(replica: Connections, subtests: pyte
             assert exchange(replica.fast, data) == exchange(replica.general, data)
 
 
-def test_generated_requests_get_the_same_answers(replica: Connections) -> None:
-    count = len(replica.answered)
-    for seed in range(150):
-        assert differences(replica, random.Random(seed))[1] == []
-    assert len(replica.answered) > count + 100, "most of them are plain"
+@pytest.fixture
+def sizes(replica: Connections, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The number of rows of each run on the event loop."""
+    sizes = list[int]()
+    act = LoadedPolicy.act_inline
 
-
-@pytest.mark.slow
-def test_many_generated_requests_get_the_same_answers(replica: Connections) -> None:
-    for seed in range(1_000, 3_000):
-        assert differences(replica, random.Random(seed))[1] == []
-
-
-def test_requests_of_one_turn_are_one_batch(replica: Connections, monkeypatch: pytest.MonkeyPatch) -> None:
-    champion = replica.server.alias_slots.champion("board")
-    assert champion is not None
-    policy, sizes = champion.policy(None), list[int]()
-    act = type(policy).act_inline
-
-    def record(policy: Any, *arguments: Any) -> Any:
+    def record(policy: LoadedPolicy, *arguments: Any) -> Any:
         actions = act(policy, *arguments)
         sizes.append(len(actions.actions))
         return actions
 
-    monkeypatch.setattr(type(policy), "act_inline", record)
+    monkeypatch.setattr(LoadedPolicy, "act_inline", record)
+    return sizes
+
+
+def test_requests_of_one_turn_are_one_batch(replica: Connections, sizes: list[int]) -> None:
     bodies = [{"observation": board} for board in boards(5)] + [{"observations": boards(3)}]
     answers = together(replica, replica.fast, [request(body) for body in bodies])
     assert sizes == [8]
-    monkeypatch.undo()
     assert answers == [exchange(replica.general, request(body)) for body in bodies]
+
+
+def test_probabilities_of_one_turn_are_one_batch(replica: Connections, sizes: list[int]) -> None:
+    requests = [request({"observation": board, "probabilities": True}) for board in boards(5)]
+    answers = together(replica, replica.fast, requests)
+    assert sizes == [5]
+    for answer, data in zip(answers, requests, strict=True):
+        one, other = (json.loads(text.partition(b"\r\n\r\n")[2]) for text in (answer, exchange(replica.general, data)))
+        assert one.pop("probabilities") == pytest.approx(other.pop("probabilities"), abs=1e-5)
+        assert one == other
+
+
+def test_some_requests_run_alone(replica: Connections, sizes: list[int]) -> None:
+    booleans = BOARD | {"action_mask": [True] * 7}
+    together(replica, replica.fast, [request({"observation": BOARD, "seed": 1})] * 3)
+    assert sizes == [1, 1, 1]
+    together(replica, replica.fast, [request({"observation": booleans})] * 2)
+    assert sizes == [1] * 5
 
 
 def test_a_queue_is_answered_over_several_turns_the_oldest_first(
     replica: Connections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    queued, take_turn = [], PlainActions._take_turn
+    queued, take_turn = [], InferenceQueue._take_turn
 
-    def record(plain: PlainActions, loop: asyncio.AbstractEventLoop) -> None:
+    def record(plain: InferenceQueue, loop: asyncio.AbstractEventLoop) -> None:
         take_turn(plain, loop)
         queued.append(replica.server.access.backlog.queued)
 
-    monkeypatch.setattr(PlainActions, "_take_turn", record)
-    monkeypatch.setattr(plain_action, "SLICE", 0)
-    monkeypatch.setattr(plain_action, "GROUP", 3)
+    monkeypatch.setattr(InferenceQueue, "_take_turn", record)
+    monkeypatch.setattr(inference_queue, "SLICE", 0)
+    monkeypatch.setattr(inference_queue, "GROUP", 3)
     bodies = [{"observation": board} for board in boards(10)]
     count = len(replica.answered)
     answers = together(replica, replica.fast, [request(body) for body in bodies])
     until(lambda: queued == [7, 4, 1, 0])
-    times = [request.time for request in replica.answered[count:]]
-    assert times == sorted(times)
+    assert len(replica.answered) == count + 10
     assert answers == [exchange(replica.general, request(body)) for body in bodies]
 
 
@@ -235,21 +243,31 @@ def test_a_slow_policy_occupies_the_event_loop_once(replica: Connections, monkey
     assert answers == [exchange(replica.general, request(body)) for body in bodies]
 
 
-def test_a_fault_in_the_fast_path_leaves_no_request_without_an_answer(
-    replica: Connections, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bug_is_answered_and_affects_no_other_request(replica: Connections, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: Any) -> None:
         raise RuntimeError("a bug")
 
-    bodies = [{"observation": board} for board in boards(3)]
-    expected = [exchange(replica.general, request(body)) for body in bodies]
-    monkeypatch.setattr(replica.server.plain_actions, "_answer", fail)
-    assert together(replica, replica.fast, [request(body) for body in bodies]) == expected
-    monkeypatch.undo()
-    monkeypatch.setattr(replica.server.access, "admission", fail)
-    assert exchange(replica.fast, request(bodies[0])).startswith(b"HTTP/1.1 500")
-    monkeypatch.undo()
-    assert together(replica, replica.fast, [request(body) for body in bodies]) == expected
+    requests = [request({"observation": BOARD}), request(VECTOR, "vector"), infer(binary_boards(1))]
+    expected = [exchange(replica.general, data) for data in requests]
+    for owner, function in (
+        (replica.server.models, "find"),
+        (type(replica.server.serving), "act"),
+        (replica.server.metrics, "count_request"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, function, fail)
+            answers = together(replica, replica.fast, requests)
+        assert [answer[9:12] for answer in answers] == [b"500"] * 3
+        assert together(replica, replica.fast, requests) == expected
+    with monkeypatch.context() as patch:
+        patch.setattr(replica.server.access, "admission", fail)
+        assert exchange(replica.fast, requests[0]).startswith(b"HTTP/1.1 500")
+    champion = replica.server.alias_slots.champion("vector")
+    assert champion is not None
+    with monkeypatch.context() as patch:
+        patch.setattr(champion.policy(None).inline_graph, "act", fail)
+        answers = together(replica, replica.fast, requests)
+    assert [answer[9:12] for answer in answers] == [b"200", b"500", b"200"]
 
 
 def test_pipelined_requests_are_answered_in_order(replica: Connections) -> None:
@@ -306,7 +324,7 @@ def test_keys_and_their_limits_hold(tmp_path: Path) -> None:
         answers = together(replica, replica.fast, [request(board, headers=keyed) for _ in range(6)])
         statuses = [answer[9:12] for answer in answers]
         assert set(statuses) == {b"200", b"429"}
-        assert len(replica.answered) == count + statuses.count(b"200")
+        assert len(replica.answered) == count + 6
         assert b"x-league-key-accepted: 1" in next(answer for answer in answers if answer[9:12] == b"200")
 
 
@@ -328,9 +346,7 @@ def test_shadows_canaries_and_mixtures(tmp_path: Path) -> None:
         until(lambda: "board" in replica.server.traffic.canaries)
         for data in requests():
             assert exchange(replica.fast, data) == exchange(replica.general, data)
-        assert len(replica.answered) == 4, "the application selects a canary"
-        exchange(replica.fast, request(VECTOR, "vector"))
-        assert len(replica.answered) == 5, "other leagues have none"
+        assert len(replica.answered) == 4 + 8
         registry.traffic.set("board", canary=None, actor="test", reason="test")
         promote(registry, "board", registry.publisher.publish_mixture("board", {1: 0.5, 2: 0.5}).number)
         until(lambda: (served := replica.server.alias_slots.champion("board")) is not None and served.members)
@@ -338,7 +354,7 @@ def test_shadows_canaries_and_mixtures(tmp_path: Path) -> None:
         answers = [exchange(replica.fast, data) for data in requests()]
         assert answers == [exchange(replica.general, data) for data in requests()]
         assert len(set(answers)) == 2
-        assert len(replica.answered) == 5 + 8
+        assert len(replica.answered) == 4 + 16
 
 
 def test_a_full_replica_refuses(tmp_path: Path) -> None:
@@ -353,7 +369,7 @@ def test_the_application_answers_pages_of_other_origins(storage: Storage) -> Non
     headers = [(b"content-length", b"2"), (b"content-type", b"application/json")]
     for origins, takes in (([], True), (["https://game.example"], False)):
         settings = QUICK.model_copy(update={"cors_origins": origins})
-        plain = Replica(Registry.open(storage), settings, "replica-1").plain_actions
+        plain = Replica(Registry.open(storage), settings, "replica-1").plain
         assert plain is not None
         assert plain.takes(b"/v1/policies/board/action", headers)
         assert plain.takes(b"/v1/policies/board/action", [*headers, (b"origin", b"https://game.example")]) is takes
