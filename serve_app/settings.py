@@ -52,6 +52,9 @@ class ServeSettings(BaseModel):
     """Open event streams of one API key per replica; further ones are refused with 429."""
     max_batch: int = Field(default=MAX_BATCH, ge=1)
     """Maximum observations in one request."""
+    unbatched: list[str] = []
+    """Models whose requests are never run together with those of other callers: `{league}`, or `{league}.{policy}` if
+    its versions have several policies."""
     timeout: float = Field(default=4.5, gt=0)
     """Timeout of a request, from its head to its response: 504, or 408 if the body did not arrive. Must be less than
     RAY_SERVE_HAPROXY_TIMEOUT_SERVER_S, after which HAProxy responds itself. Clients can request a shorter timeout

@@ -71,7 +71,7 @@ class Serving:
         """
         can_share = options.seed is None and not (policy.state or options.analysis)
         is_small = observations.is_joinable and observations.rows <= policy.inline_rows
-        is_joint = can_share and is_small
+        is_joint = can_share and is_small and policy.model not in self.settings.unbatched
         answer = await Run(self.batches, policy, observations, options) if is_joint else None
         if answer is None:
             started = perf_counter_ns()

@@ -167,12 +167,18 @@ def test_probabilities_of_one_turn_are_one_batch(replica: Connections, sizes: li
         assert one == other
 
 
-def test_some_requests_run_alone(replica: Connections, sizes: list[int]) -> None:
+def test_some_requests_run_alone(replica: Connections, sizes: list[int], tmp_path: Path) -> None:
     booleans = BOARD | {"action_mask": [True] * 7}
     together(replica, replica.fast, [request({"observation": BOARD, "seed": 1})] * 3)
     assert sizes == [1, 1, 1]
     together(replica, replica.fast, [request({"observation": booleans})] * 2)
     assert sizes == [1] * 5
+    settings = AT_ONCE.model_copy(update={"unbatched": ["board", "duo.left"]})
+    with changing(Storage.at(tmp_path / "home"), settings) as (excepting, _):
+        sizes.clear()
+        for model in ("board", "board.shared", "duo.left", "duo.right"):
+            together(excepting, excepting.fast, [request({"observation": BOARD}, model)] * 2)
+    assert sizes == [1] * 6 + [2]
 
 
 def test_a_queue_is_answered_over_several_turns_the_oldest_first(
