@@ -1,4 +1,4 @@
-"""Decodes JSON observations and recurrent state to the input arrays of a policy."""
+"""Decodes JSON observations to the input arrays of a policy."""
 
 from collections.abc import Iterable, KeysView, Sequence
 from itertools import chain
@@ -82,18 +82,6 @@ class ObservationReader:
                 raise ObservationError(f"{where} lacks the key {key}, expected an object with {', '.join(keys)}")
             unknown = min(value.keys() - keys)
             raise ObservationError(f"{where} has the unknown key {unknown[:64]!r}, expected {', '.join(keys)}")
-
-
-def read_state(value: Any, leaves: Iterable[tuple[str, Leaf]], batch: int) -> dict[str, NDArray]:
-    """Decode recurrent state in the format of a response: name → nested lists, with one row per observation."""
-    expected = dict(leaves)
-    if type(value) is not dict or value.keys() != expected.keys():
-        raise ObservationError(f"state must be null or the state of an earlier response, with {', '.join(expected)}")
-    arrays = {name: check(name, _array(name, value[name], leaf), leaf) for name, leaf in expected.items()}
-    for name, array in arrays.items():
-        if len(array) != batch:
-            raise ObservationError(f"{name} has {len(array)} rows, expected {batch}: one per observation")
-    return arrays
 
 
 def reject_strings(document: Any) -> None:

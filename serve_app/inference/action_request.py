@@ -13,10 +13,9 @@ from league.policies.draws import probabilities
 from league.policies.policy import Arrays
 from league.search.searched_actions import SearchedActions
 from league.spaces import ACTION_MASK
-from league.spaces.observation_codec import json_type, read_state, reject_strings
+from league.spaces.observation_codec import json_type
 from serve_app.codecs.request_limits import LARGE_BODY
-from serve_app.codecs.state_tokens import StateToken, common_version, read_token, write_tokens
-from serve_app.codecs.state_tokens import read_state as state_of_tokens
+from serve_app.codecs.state_tokens import StateToken, common_version, read_state, read_token, write_tokens
 from serve_app.inference.batches import Answer
 from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.resolver import version_of
@@ -35,9 +34,6 @@ class DecodedActionRequest:
 
     observations: list[Any]
     is_batch: bool
-    state: dict[str, Any] | None
-    """Recurrent state as arrays, not decoded yet; empty at the start of episodes if the response's state shall be
-    arrays."""
     tokens: list[StateToken | None] | None
     """Recurrent state as tokens, one per observation; None at the start of an episode."""
     options: ActionOptions
@@ -64,22 +60,19 @@ def parse_action_request(document: dict[str, Any], max_batch: int) -> DecodedAct
     if len(observations) > max_batch:
         raise BodyTooLarge(f"observations has {len(observations)} items, expected at most {max_batch}")
     if len(document) == 1:
-        return DecodedActionRequest(observations, is_batch, None, None, DEFAULT, 1, 0)
+        return DecodedActionRequest(observations, is_batch, None, DEFAULT, 1, 0)
     explore = parse_flag(document, "explore") if "explore" in document else None
     probabilities = parse_flag(document, "probabilities")
     analysis, deadline = parse_flag(document, "analysis"), _deadline(document.get("deadline_ms"))
     seed = document.get("seed")
     _check_seed(seed, len(observations) if is_batch else None)
-    arrays, tokens, strings = None, None, len(document)
+    tokens, strings = None, len(document)
     if (state := document.get("state")) is not None:
-        if type(state) is dict:
-            arrays, strings = state, strings + len(state)
-        else:
-            tokens = _tokens(state, len(observations) if is_batch else None)
-            strings += sum(token is not None for token in tokens)
+        tokens = _tokens(state, len(observations) if is_batch else None)
+        strings += sum(token is not None for token in tokens)
     options = ActionOptions(explore, seed, "distribution" if probabilities else None, deadline, analysis)
     booleans = sum(type(value) is bool for value in document.values())
-    return DecodedActionRequest(observations, is_batch, arrays, tokens, options, strings, booleans)
+    return DecodedActionRequest(observations, is_batch, tokens, options, strings, booleans)
 
 
 def reject_unknown_keys(document: dict[str, Any], known: frozenset[str]) -> None:
@@ -185,17 +178,13 @@ def observations_of(
     return JsonObservations(observations, is_plain, is_joinable, is_large)
 
 
-def decode_state(request: DecodedActionRequest, policy: LoadedPolicy, has_strings: bool = True) -> Arrays | None:
-    """Decode the recurrent state of the request. Raises ObservationError or InvalidState."""
-    if not request.state and not any(request.tokens or ()):
+def decode_state(request: DecodedActionRequest, policy: LoadedPolicy) -> Arrays | None:
+    """Decode the recurrent state of the request. Raises InvalidState."""
+    if request.tokens is None or not any(request.tokens):
         return None
     if not policy.state:
         raise InvalidState("state must be null: this policy is not recurrent")
-    if request.tokens is not None:
-        return state_of_tokens(request.tokens, policy.qualified, policy.sha256, policy.state)
-    if has_strings:
-        reject_strings(request.state)
-    return read_state(request.state, policy.state, len(request.observations))
+    return read_state(request.tokens, policy.qualified, policy.sha256, policy.state)
 
 
 def encode_state(state: dict[str, NDArray], policy: LoadedPolicy) -> list[str]:

@@ -121,8 +121,6 @@ class StreamSession:
         for key in stream_keys:
             del document[key]
         request = parse_action_request(document, self._serving.settings.max_batch)
-        if request.state is not None:
-            raise InvalidState("state is an object, expected a token: streams do not accept arrays")
         is_anew = reset is True or ("state" in document and document["state"] is None)
         policy, state = await self._select(request, is_anew, _resets(reset, request))
         observations = observations_of(request, policy, data, len(stream_keys))

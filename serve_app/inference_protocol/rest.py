@@ -17,11 +17,11 @@ from league.errors import InvalidInput, NotReady
 from serve_app.access.request_body import MAX_CHANGE_BODY, parse_json_object, read_bytes
 from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.declaration import CALLER, REPLICA_HEADER, TIMEOUT, Declaration, Parameter
-from serve_app.inference.http_route import JSON, HttpRoute, Reply, ResponseHeaders
+from serve_app.inference.http_route import JSON, HttpRoute, Reply
 from serve_app.inference.stream_codec import BinaryObservations
 from serve_app.inference_protocol.catalogue import ModelCatalogue
 from serve_app.inference_protocol.inference import API, Inference, Outputs
-from serve_app.inference_protocol.rest_codec import RestRequest, compressed, read_request, write_response
+from serve_app.inference_protocol.rest_codec import RestRequest, read_request, write_response
 from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.registry_watcher import RegistryWatcher
 from serve_app.live_versions.traffic_split import Headers
@@ -257,14 +257,13 @@ class InferRoute(HttpRoute):
         `state_in_<i>`.
 
         The body is JSON, optionally followed by binary tensors; then `Inference-Header-Content-Length` is the length of
-        the JSON part. Request (`Content-Encoding: gzip` or `deflate`) and response (`Accept-Encoding`) can be
-        compressed.
+        the JSON part. It can be compressed (`Content-Encoding: gzip` or `deflate`).
         """
         await self.respond(scope, receive, send, scope["path_params"].get("version", ""))
 
     async def answer(self, model: str, version: str, headers: Headers, body: bytes, begun: int) -> Reply:
         """See `HttpRoute`."""
-        header_length, accepted = framing(headers)
+        header_length = framing(headers)
         policy = await self._inference.find(model, version, headers)
         head = body[:header_length] if header_length is not None and header_length <= MAX_HEAD else b""
         layout, inputs = self._layouts.get(policy, {}).get(head), None
@@ -282,14 +281,7 @@ class InferRoute(HttpRoute):
         content, length = await self._inference.infer(policy, request.infer, write, begun, inputs)
         if head and inputs is None and len(body) <= LARGE_BODY:
             self._keep(policy, head, request)
-        lines: ResponseHeaders = (
-            JSON if length is None else ((b"content-type", BINARY), (HEADER_LENGTH, b"%d" % length))
-        )
-        if accepted:
-            content, encoding = await compressed(content, accepted)
-            lines += ((b"vary", b"accept-encoding"),)
-            if encoding is not None:
-                lines += ((b"content-encoding", encoding),)
+        lines = JSON if length is None else ((b"content-type", BINARY), (HEADER_LENGTH, b"%d" % length))
         return Reply(policy.number, content, lines)
 
     def _keep(self, policy: LoadedPolicy, head: bytes, request: RestRequest) -> None:
@@ -306,14 +298,9 @@ class InferRoute(HttpRoute):
             layouts[head] = Layout(request, [tensors[port.name] for port in policy.observed], end, rows)
 
 
-def framing(headers: Headers) -> tuple[int | None, bytes]:
-    """Inference-Header-Content-Length and Accept-Encoding. Raises InvalidInput."""
-    header_length, accepted = None, b""
-    for name, value in headers:
-        if name == HEADER_LENGTH:
-            if not value.isdigit() or len(value) > LENGTH_DIGITS:
-                raise InvalidInput("Inference-Header-Content-Length must be a number of bytes")
-            header_length = int(value)
-        elif name == b"accept-encoding":
-            accepted = value
-    return header_length, accepted
+def framing(headers: Headers) -> int | None:
+    """Inference-Header-Content-Length. Raises InvalidInput."""
+    value = next((value for name, value in headers if name == HEADER_LENGTH), None)
+    if value is not None and (not value.isdigit() or len(value) > LENGTH_DIGITS):
+        raise InvalidInput("Inference-Header-Content-Length must be a number of bytes")
+    return None if value is None else int(value)

@@ -1,4 +1,4 @@
-"""Encodes REST bodies of the protocol: JSON with optional binary tensors, optionally compressed.
+"""Encodes REST bodies of the protocol: JSON with optional binary tensors.
 
     Inference-Header-Content-Length: length of the JSON         (absent without binary tensors)
     {"inputs": [{…, "parameters": {"binary_data_size": size}}, {…, "data": [ … ]}], "outputs": […]}  bytes  bytes …
@@ -7,8 +7,6 @@ An optional field may be null, as serialisers of Java and C# write it. Classific
 supported.
 """
 
-import asyncio
-import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,28 +15,9 @@ import orjson
 from league.errors import InvalidInput
 from league.spaces.observation_codec import json_type
 from serve_app.access.errors import MalformedBody
-from serve_app.access.request_body import WINDOW_BITS, parse_json_object
+from serve_app.access.request_body import parse_json_object
 from serve_app.inference_protocol.inference import InferRequest, Outputs
 from serve_app.inference_protocol.tensors import RequestTensor, datatype_of, to_bytes
-
-LEVEL = 1
-"""The fastest level."""
-MIN_COMPRESSED_BYTES = 1024
-"""Smaller responses are not compressed."""
-ENCODINGS = (b"gzip", b"deflate")
-
-
-async def compressed(body: bytes, accepted: bytes) -> tuple[bytes, bytes | None]:
-    """Compress a body as Accept-Encoding permits; returns it with its Content-Encoding."""
-    if len(body) < MIN_COMPRESSED_BYTES:
-        return body, None
-    # The first encoding that is supported. Weights are ignored, except `q=0`.
-    for item in accepted.lower().split(b","):
-        name, _, quality = item.partition(b";")
-        if (encoding := name.strip()) in ENCODINGS and quality.replace(b" ", b"").strip(b"0.") != b"q=":
-            return await asyncio.to_thread(zlib.compress, body, LEVEL, WINDOW_BITS[encoding]), encoding
-    return body, None
-
 
 SIZE = "binary_data_size"
 SEQUENCE = "sequence_id"

@@ -92,15 +92,11 @@ class ActionRoute(HttpRoute):
             version = pinned_version(request, model, version, await models.members(model, version))
         policy = await models.find(model, version, headers)
         observations = observations_of(request, policy, body)
-        state = decode_state(request, policy, not observations.is_plain)
-        answer = await self.serving.act(policy, observations, request.options, state)
+        answer = await self.serving.act(policy, observations, request.options, decode_state(request, policy))
         response = build_response(request, answer, policy)
-        if (new_state := answer.output.state) is not None:
-            if request.state is not None:
-                response["state"] = {name: array.tolist() for name, array in new_state.items()}
-            else:
-                tokens = encode_state(new_state, policy)
-                response["state"] = tokens if request.is_batch else tokens[0]
+        if (state := answer.output.state) is not None:
+            tokens = encode_state(state, policy)
+            response["state"] = tokens if request.is_batch else tokens[0]
         content = orjson.dumps(response)[:-1] + policy.signature(model)
         self.serving.count(API, policy, observations.rows, begun)
         return Reply(policy.number, content)

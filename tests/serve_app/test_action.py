@@ -304,21 +304,8 @@ def test_each_episode_of_a_batch_has_its_own_token(read_only_client: TestClient)
     assert isinstance(act_with_state(read_only_client, tokens[1])["state"], str), "a token of a batch can be used alone"
 
 
-def test_state_can_be_sent_and_returned_as_arrays(read_only_client: TestClient) -> None:
-    state: dict[str, Any] = {}
-    actions = []
-    for _ in range(4):
-        reply = act_with_state(read_only_client, state)
-        state = reply["state"]
-        actions.append(reply["action"])
-    assert (actions, state) == ([0, 0, 1, 1], {"state_in_0": [[4.0]]})
-    for other in ({"state_in_0": [[1], [2]]}, {"other": 1}):
-        assert rejected(read_only_client, {"observation": [1], "state": other}, model="memory")
-
-
 def test_a_policy_without_state_accepts_none(read_only_client: TestClient) -> None:
-    for empty in (None, {}):
-        assert "state" not in act(read_only_client, observation=BOARD, state=empty)
+    assert "state" not in act(read_only_client, observation=BOARD, state=None)
     assert "state" not in act(read_only_client, observations=[BOARD], state=[None])
     for state in (act_with_state(read_only_client, None)["state"], {"state_in_0": [[1]]}):
         assert rejected(read_only_client, {"observation": BOARD, "state": state})["code"] == "invalid_state"

@@ -156,8 +156,7 @@ export interface paths {
          *     `state_in_<i>`.
          *
          *     The body is JSON, optionally followed by binary tensors; then `Inference-Header-Content-Length` is the length of
-         *     the JSON part. Request (`Content-Encoding: gzip` or `deflate`) and response (`Accept-Encoding`) can be
-         *     compressed.
+         *     the JSON part. It can be compressed (`Content-Encoding: gzip` or `deflate`).
          */
         post: operations["infer"];
         delete?: never;
@@ -193,8 +192,7 @@ export interface paths {
          *     `state_in_<i>`.
          *
          *     The body is JSON, optionally followed by binary tensors; then `Inference-Header-Content-Length` is the length of
-         *     the JSON part. Request (`Content-Encoding: gzip` or `deflate`) and response (`Accept-Encoding`) can be
-         *     compressed.
+         *     the JSON part. It can be compressed (`Content-Encoding: gzip` or `deflate`).
          */
         post: operations["version_infer"];
         delete?: never;
@@ -2516,10 +2514,6 @@ export interface components {
         };
         /** @description An opaque token from a previous response. */
         Token: string;
-        /** @description The state as arrays with one row per observation, for programs that store arrays; `{}` starts an episode. Requires an explicit `version`. */
-        ArrayState: {
-            [key: string]: components["schemas"]["Numbers"];
-        };
         ActionRequest: {
             observation?: components["schemas"]["Observation"];
             /** @description A batch, instead of `observation`. */
@@ -2535,7 +2529,7 @@ export interface components {
             /** @description For search versions: return what the search expects; by default not. */
             analysis?: boolean;
             /** @description For recurrent policies: the token, or null at the start of an episode. In a batch: one per observation. */
-            state?: components["schemas"]["Token"] | (components["schemas"]["Token"] | null)[] | components["schemas"]["ArrayState"] | null;
+            state?: components["schemas"]["Token"] | (components["schemas"]["Token"] | null)[] | null;
         } & (unknown | unknown);
         Seed: number;
         /**
@@ -2557,7 +2551,7 @@ export interface components {
             /** @description Of search versions: the simulations of the search, in a batch for each observation. */
             simulations?: number | number[];
             analysis?: components["schemas"]["Analysis"] | components["schemas"]["Analysis"][];
-            state?: components["schemas"]["Token"] | components["schemas"]["Token"][] | components["schemas"]["ArrayState"];
+            state?: components["schemas"]["Token"] | components["schemas"]["Token"][];
         } & (unknown | unknown);
         /** @description What a search expects. */
         Analysis: {

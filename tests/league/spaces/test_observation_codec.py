@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from league.errors import ObservationError
 from league.spaces import Box, DictSpace, Discrete, MultiBinary, Space, observation_codec
 from league.spaces.arrays import tensors
-from league.spaces.observation_codec import ObservationReader, read_state, reject_strings
+from league.spaces.observation_codec import ObservationReader, reject_strings
 
 GRID = Box(dtype="uint8", shape=(2, 3), low=0, high=255)
 
@@ -67,14 +67,6 @@ def test_nested_strings_are_found() -> None:
     reject_strings({"a": [1, [2.5, None, {"b": True}]]})
     with pytest.raises(ObservationError, match="'deep'"):
         reject_strings({"a": [1, [2, {"b": "deep"}]]})
-
-
-def test_state_has_a_row_for_each_observation() -> None:
-    leaves = [("state_in_0", SPEED)]
-    assert read_state({"state_in_0": [[1, 2], [3, 4]]}, leaves, 2)["state_in_0"].shape == (2, 2)
-    for invalid in (None, {}, {"state_in_0": [[1, 2]]}, {"state_in_0": [1, 2]}, {"state_in_1": [[1, 2]] * 2}):
-        with pytest.raises(ObservationError, match="state"):
-            read_state(invalid, leaves, 2)
 
 
 def test_zeros_are_valid_observations_and_keys_are_counted() -> None:

@@ -46,7 +46,7 @@ def token_of(version: int, model: str = "memory.shared") -> str:
 def test_one_observation_is_a_batch_of_one() -> None:
     request = parse_action_request({"observation": [1, 2]}, max_batch=8)
     assert (request.observations, request.is_batch, request.strings) == ([[1, 2]], False, 1)
-    assert (request.options, request.state, request.tokens) == (ActionOptions(), None, None)
+    assert (request.options, request.tokens) == (ActionOptions(), None)
 
 
 def test_all_options_are_parsed() -> None:
@@ -64,12 +64,6 @@ def test_all_options_are_parsed() -> None:
     assert ask.strings == 6, "five keys, one token"
 
 
-def test_state_can_be_arrays() -> None:
-    request = parse_action_request({"observation": 1, "state": {"state_in_0": [[1.0]]}}, max_batch=8)
-    assert (request.state, request.tokens, request.strings) == ({"state_in_0": [[1.0]]}, None, 3)
-    assert parse_action_request({"observation": 1, "state": {}}, max_batch=8).state == {}
-
-
 INVALID: tuple[tuple[dict[str, Any], type[LeagueError], str], ...] = (
     ({}, InvalidInput, "neither observation nor observations"),
     ({"observation": 1, "observations": [1]}, InvalidInput, "both observation and observations"),
@@ -85,6 +79,7 @@ INVALID: tuple[tuple[dict[str, Any], type[LeagueError], str], ...] = (
     ({"observations": [1, 2], "seed": [1]}, InvalidInput, "seed has 1 integers, expected 2"),
     ({"observations": [1, 2], "seed": [1, "2"]}, InvalidInput, "seed must be"),
     ({"observation": 1, "state": 3}, InvalidState, "one string per observation"),
+    ({"observation": 1, "state": {"state_in_0": [[1.0]]}}, InvalidState, "one string per observation"),
     ({"observation": 1, "state": [token_of(7)]}, InvalidState, "one string per observation"),
     ({"observations": [1], "state": token_of(7)}, InvalidState, "state is a string, expected a list"),
     ({"observations": [1, 2], "state": [token_of(7)]}, InvalidState, "state has 1 items, expected 2"),

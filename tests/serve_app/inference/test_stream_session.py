@@ -235,7 +235,7 @@ INVALID_OPTIONS: tuple[tuple[dict[str, Any], str, str], ...] = (
     (ONE | {"return_state": "yes"}, "invalid_input", "return_state"),
     ({"reset": False}, "invalid_input", "neither observation nor observations"),
     ({"reset": True, "explore": True}, "invalid_input", "neither observation nor observations"),
-    (ONE | {"state": {}}, "invalid_state", "streams do not accept arrays"),
+    (ONE | {"state": {}}, "invalid_state", "one string per observation"),
     (ONE | {"state": "AQEA"}, "invalid_state", "not a complete token"),
     (ONE | {"forget": True}, "invalid_input", "'forget'"),
     ({"observation": ["1"]}, "invalid_observation", "where a number"),

@@ -236,22 +236,6 @@ def test_an_optional_field_may_be_null(client: TestClient) -> None:
     assert "the id of the request is a number" in error_of(infer(client, {"id": 1, "inputs": [VECTOR]}))
 
 
-def test_a_large_response_is_compressed_if_accepted(client: TestClient) -> None:
-    for accepted, encoding in (
-        ("gzip", "gzip"),
-        ("deflate", "deflate"),
-        ("br, gzip;q=0.8", "gzip"),
-        ("gzip;q=0", None),
-        ("br", None),
-        ("", None),
-    ):
-        reply = infer(client, {"inputs": CHESS}, "chess", **{"Accept-Encoding": accepted})
-        assert reply.headers.get("content-encoding") == encoding
-        assert len(reply.json()["outputs"][1]["data"]) == 4672
-        small = infer(client, {"inputs": [VECTOR]}, **{"Accept-Encoding": accepted})
-        assert "content-encoding" not in small.headers
-
-
 def test_metadata_without_a_database_lists_the_loaded_versions(
     leagues: Storage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
