@@ -97,7 +97,7 @@ class ModelCatalogue:
         if version:
             model_documents = [document for document in model_documents if document["version"] == str(policy.number)]
         if all(document["version"] != str(policy.number) for document in model_documents):
-            model_documents.append(ModelStatistics().document(policy.model, policy.number))
+            model_documents.append(ModelStatistics(policy.model, policy.number).document)
         return {"model_stats": model_documents}
 
     async def index(self, only_ready: bool = False) -> list[Document]:

@@ -8,7 +8,7 @@ no cache; its fields are 0.
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from copy import deepcopy
 from typing import Any
 
 REPORT = "open_inference_statistics"
@@ -18,78 +18,44 @@ MAX_ENTRIES = 1024
 
 
 Document = dict[str, Any]
+PARTS = ("success", "fail", "queue", "compute_input", "compute_infer", "compute_output", "cache_hit", "cache_miss")
+"""Of these, `queue` is waiting to be answered, and looking up the version. Clients such as perf_analyzer read from its
+count which version has answered."""
 
 
-@dataclass(slots=True)
-class Duration:
-    """A count and the total duration."""
-
-    count: int = 0
-    ns: int = 0
-
-    def add(self, ns: int) -> None:
-        self.count += 1
-        self.ns += ns
-
-    def document(self) -> dict[str, int]:
-        return {"count": self.count, "ns": self.ns}
-
-
-@dataclass(slots=True)
 class ModelStatistics:
-    """Statistics of one version of one policy."""
+    """Statistics of one version of one policy. document: in the format of the statistics extension."""
 
-    last_inference: int = 0
-    """Milliseconds since the epoch; 0 before the first."""
-    inference_count: int = 0
-    execution_count: int = 0
-    success: Duration = field(default_factory=Duration)
-    failure: Duration = field(default_factory=Duration)
-    queue: Duration = field(default_factory=Duration)
-    """Waiting to be answered, and looking up the version. Clients such as perf_analyzer read from its count which
-    version has answered."""
-    input: Duration = field(default_factory=Duration)
-    """Decoding and checking tensors."""
-    infer: Duration = field(default_factory=Duration)
-    """Running the graph, including the wait for a thread if the batch is large."""
-    output: Duration = field(default_factory=Duration)
-    """Encoding the response."""
+    def __init__(self, name: str, version: int) -> None:
+        self._durations = {part: {"count": 0, "ns": 0} for part in PARTS}
+        self.document: Document = {
+            "name": name,
+            "version": str(version),
+            "last_inference": 0,  # milliseconds since the epoch
+            "inference_count": 0,
+            "execution_count": 0,
+            "inference_stats": self._durations,
+        }
 
     def fail(self, ns: int) -> None:
         """Count a request that failed after `ns` nanoseconds."""
-        self.failure.add(ns)
+        self._add("fail", ns)
 
     def succeed(self, rows: int, begun: int, found: int, read: int, ran: int, done: int, executions: int = 1) -> None:
         """Count a request of `rows` observations, and the runs for it; the other arguments are times in nanoseconds."""
-        self.last_inference = time.time_ns() // 1_000_000
-        self.inference_count += rows
-        self.execution_count += executions
-        self.success.add(done - begun)
-        self.queue.add(found - begun)
-        self.input.add(read - found)
-        self.infer.add(ran - read)
-        self.output.add(done - ran)
+        self.document["last_inference"] = time.time_ns() // 1_000_000
+        self.document["inference_count"] += rows
+        self.document["execution_count"] += executions
+        self._add("success", done - begun)
+        self._add("queue", found - begun)
+        self._add("compute_input", read - found)
+        self._add("compute_infer", ran - read)
+        self._add("compute_output", done - ran)
 
-    def document(self, name: str, version: int) -> dict[str, Any]:
-        """In the format of the statistics extension."""
-        nothing = Duration().document()
-        return {
-            "name": name,
-            "version": str(version),
-            "last_inference": self.last_inference,
-            "inference_count": self.inference_count,
-            "execution_count": self.execution_count,
-            "inference_stats": {
-                "success": self.success.document(),
-                "fail": self.failure.document(),
-                "queue": self.queue.document(),
-                "compute_input": self.input.document(),
-                "compute_infer": self.infer.document(),
-                "compute_output": self.output.document(),
-                "cache_hit": nothing,
-                "cache_miss": nothing,
-            },
-        }
+    def _add(self, part: str, ns: int) -> None:
+        duration = self._durations[part]
+        duration["count"] += 1
+        duration["ns"] += ns
 
 
 def sum_documents(documents: Iterable[Document]) -> list[Document]:
@@ -124,7 +90,7 @@ class Statistics:
         """The entry of a version, created if necessary."""
         key = (name, version)
         if (entry := self._entries.get(key)) is None:
-            entry = self._entries[key] = ModelStatistics()
+            entry = self._entries[key] = ModelStatistics(name, version)
             if len(self._entries) > MAX_ENTRIES:
                 self._entries.popitem(last=False)
         else:
@@ -134,7 +100,7 @@ class Statistics:
     def documents(self, name: str | None = None, version: int | None = None) -> list[dict[str, Any]]:
         """The entries of a model and a version, by default all."""
         return [
-            entry.document(of, number)
+            deepcopy(entry.document)
             for (of, number), entry in sorted(self._entries.items())
             if name in (None, of) and version in (None, number)
         ]

@@ -255,7 +255,7 @@ def test_durations_are_of_the_parts_of_a_request() -> None:
     entry.succeed(3, begun=0, found=1, read=10, ran=100, done=1000)
     entry.succeed(2, begun=0, found=0, read=1, ran=2, done=3, executions=0)
     entry.fail(50)
-    document = entry.document("board", 1)
+    document = entry.document
     assert (document["inference_count"], document["execution_count"]) == (5, 1)
     assert document["inference_stats"] == {
         "success": {"count": 2, "ns": 1003},
