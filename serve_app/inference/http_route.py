@@ -45,9 +45,17 @@ class HttpRoute(ABC):
 
     @abstractmethod
     async def answer(self, model: str, version: str, headers: Headers, body: bytes, begun: int) -> Reply:
-        """Answer a request that was accepted. Raises LeagueError.
+        """Answer a request that was accepted.
 
-        version: a number or an alias; empty for the champion. begun: when it began, a time of `perf_counter_ns`.
+        Args:
+            model: `{league}` or `{league}.{policy}`.
+            version: A number or an alias. It may be empty in the Open Inference Protocol: the champion.
+            headers: Those of the request.
+            body: Decompressed.
+            begun: When the request began, a time of `perf_counter_ns`.
+
+        Raises:
+            LeagueError: The request is refused, or its policy fails.
         """
 
     async def respond(

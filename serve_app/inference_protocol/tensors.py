@@ -55,7 +55,7 @@ Data = Sequence[Any] | bytes | memoryview
 
 
 class Inputs(NamedTuple):
-    """The inputs of a request, which are not binary or large. See `Observations`."""
+    """The inputs of a request with lists or recurrent state, or of a large one. See `Observations`."""
 
     tensors: Sequence[RequestTensor]
     rows: int

@@ -105,15 +105,17 @@ class InferenceQueue:
 
     def _take_turn(self, loop: AbstractEventLoop) -> None:
         end = monotonic() + SLICE
-        self._admit()
-        while self._queue:
-            self._answer_group()
-            if monotonic() > end:
-                break
-        self._serving.access.backlog.queued = len(self._queue)
-        self._has_turn = bool(self._queue)
-        if self._has_turn:
-            loop.call_soon(self._take_turn, loop)
+        try:
+            self._admit()
+            while self._queue:
+                self._answer_group()
+                if monotonic() > end:
+                    break
+        finally:  # whatever happens to one connection
+            self._serving.access.backlog.queued = len(self._queue)
+            self._has_turn = bool(self._queue)
+            if self._has_turn:
+                loop.call_soon(self._take_turn, loop)
 
     def flush(self) -> None:
         """See `PlainRequests.flush`."""

@@ -276,6 +276,29 @@ def test_a_bug_is_answered_and_affects_no_other_request(replica: Connections, mo
     assert [answer[9:12] for answer in answers] == [b"200", b"500", b"200"]
 
 
+def test_a_connection_that_cannot_be_answered_affects_no_other(
+    replica: Connections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every request of a turn is answered, although writing the first response fails."""
+    requests = [request({"observation": board}) for board in boards(5)]
+    expected = [exchange(replica.general, data) for data in requests]
+    answer, failures = HttpProtocol.answer, [RuntimeError("a bug")]
+
+    def fail_once(protocol: HttpProtocol, *rest: Any) -> None:
+        if failures:
+            protocol.transport.close()
+            raise failures.pop()
+        answer(protocol, *rest)
+
+    with socket.create_connection(replica.fast) as connection:
+        exchange(replica.fast, requests[0])
+        with monkeypatch.context() as patch:
+            patch.setattr(HttpProtocol, "answer", fail_once)
+            connection.sendall(request({"observation": BOARD, "seed": 1}))
+            assert connection.recv(1) == b""
+            assert together(replica, replica.fast, requests) == expected
+
+
 def test_pipelined_requests_are_answered_in_order(replica: Connections) -> None:
     requests = [request({"observation": BOARD}), OTHERS["probabilities"], request(VECTOR, "vector"), OTHERS["illegal"]]
     for parts in (requests, requests[::-1]):
