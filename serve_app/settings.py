@@ -64,7 +64,8 @@ class ServeSettings(BaseModel):
     operator, and the request gets 504. Less than `timeout`, so that the request is not answered before."""
     max_waiting: int = Field(default=1024, ge=1)
     """Inference requests that may wait on the event loop, including those on connections that are not accepted yet. If
-    more wait for longer than `burst_tolerance`, the excess is refused with 429."""
+    more wait for longer than `burst_tolerance`, or more than are answered in about 0.25 s, the excess is refused with
+    429."""
     max_turn: float = Field(default=0.025, gt=0)
     """The corresponding time limit: if turns of the event loop take longer for more than `burst_tolerance`, requests
     that a turn reaches later than this are refused with 429. An accepted request waits for at most two turns."""

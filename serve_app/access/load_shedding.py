@@ -3,9 +3,9 @@
 A replica handles requests on one event loop, and runs small inferences on it. Most of its queue is therefore implicit:
 requests that arrived while the loop was busy, all of which start in the next turn, and connections that are not
 accepted yet. Those of the fast path wait in a queue of their own. A turn accepts requests until `limit` of them wait,
-and only those that it reaches within `time_limit` seconds. As in CoDel (Nichols and Jacobson, 2012, "Controlling queue
-delay"), bursts may exceed both limits; requests are refused only when the queue stays too long for more than
-`burst_tolerance` seconds.
+or as many as are answered in MAX_WAIT seconds, and only those that it reaches within `time_limit` seconds. As in CoDel
+(Nichols and Jacobson, 2012, "Controlling queue delay"), bursts may exceed all limits; requests are refused only when
+the queue stays too long for more than `burst_tolerance` seconds.
 """
 
 import asyncio
@@ -16,6 +16,10 @@ from league.errors import Overloaded
 from serve_app.runtime.uvicorn_http import AcceptQueue
 
 NEVER = float("inf")
+MAX_WAIT = 0.25
+"""Seconds that a request of the queue waits, nearly, before further ones are refused."""
+WEIGHT = 1 / 8
+"""That of the last turn in the mean duration of a request."""
 
 
 class Backlog:
@@ -32,6 +36,7 @@ class Backlog:
         "_limit",
         "_overloaded_since",
         "_queue",
+        "_seconds",
         "_time_limit",
         "_turn_started",
         "_unaccepted",
@@ -52,11 +57,19 @@ class Backlog:
         self._waiting = 0
         self.queued = 0
         """Accepted requests of earlier turns that still wait."""
+        self._seconds = 0.0
+        """Mean duration of a request of the queue."""
         self.turn = 0
         """Number of turns in which requests were admitted."""
         self._turn_started = 0.0
         self._overloaded_since = NEVER
         self._is_continuing = False
+
+    def end_slice(self, answered: int, seconds: float, queued: int) -> None:
+        """The queue has `answered` requests in this turn, in `seconds`, and `queued` ones wait for the next one."""
+        self.queued = queued
+        if answered:
+            self._seconds += WEIGHT * (seconds / answered - self._seconds)
 
     def watch_port(self, port: int) -> None:
         """Also count connections that wait to be accepted on this port. Later calls have no effect."""
@@ -81,7 +94,9 @@ class Backlog:
         self.turn += 1
         self._waiting = 0
         if not is_overloaded:
-            self._overloaded_since = NEVER
+            # A queue must have become short, or each burst that follows would be tolerated anew.
+            if 2 * self.queued < min(self._limit, MAX_WAIT / self._seconds if self._seconds else NEVER):
+                self._overloaded_since = NEVER
             return
         self._overloaded_since = min(self._overloaded_since, self._clock())
         self._is_continuing = False
@@ -94,6 +109,7 @@ class Backlog:
             self._overloaded_since = NEVER
 
     def _is_overloaded(self) -> bool:
-        if self.queued + self._waiting + self._unaccepted > self._limit:
+        waiting = self.queued + self._waiting + self._unaccepted
+        if waiting > self._limit or (self.queued and waiting * self._seconds > MAX_WAIT):
             return True
         return self._waiting > 1 and self._clock() - self._turn_started > self._time_limit

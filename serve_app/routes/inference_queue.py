@@ -8,8 +8,8 @@ continues in the application. So do those that never come here: large bodies, an
 once, here or by the middleware.
 
 Requests that arrive faster than they are answered wait in a queue, the oldest first. It has at most `max_waiting`
-requests (see `Backlog`), with bodies of at most LARGE_BODY bytes that are not parsed yet. A turn ends after SLICE
-seconds, so that new requests are accepted or refused soon.
+requests, or as many as are answered soon (see `Backlog`), with bodies of at most LARGE_BODY bytes that are not parsed
+yet. A turn ends after SLICE seconds, so that new requests are accepted or refused soon.
 """
 
 from asyncio import AbstractEventLoop
@@ -104,15 +104,14 @@ class InferenceQueue:
             connection.loop.call_soon(self._take_turn, connection.loop)
 
     def _take_turn(self, loop: AbstractEventLoop) -> None:
-        end = monotonic() + SLICE
+        begin, answered = monotonic(), 0
         try:
             self._admit()
-            while self._queue:
+            while self._queue and (not answered or monotonic() < begin + SLICE):
+                answered += min(GROUP, len(self._queue))
                 self._answer_group()
-                if monotonic() > end:
-                    break
         finally:  # whatever happens to one connection
-            self._serving.access.backlog.queued = len(self._queue)
+            self._serving.access.backlog.end_slice(answered, monotonic() - begin, len(self._queue))
             self._has_turn = bool(self._queue)
             if self._has_turn:
                 loop.call_soon(self._take_turn, loop)

@@ -249,6 +249,23 @@ async def test_requests_of_earlier_turns_take_places_until_they_are_answered() -
     assert await loop.turn(20, 0.02) == 20, "the time starts again"
 
 
+async def test_a_queue_has_as_many_requests_as_are_answered_soon() -> None:
+    heavy, light = Loop(limit=1000), Loop(limit=1000)
+    for loop, seconds in ((heavy, 0.005), (light, 0.0001)):
+        for _ in range(100):
+            loop.backlog.end_slice(32, 32 * seconds, queued=40)
+        for _ in range(6):
+            await loop.turn(200, 0.03)
+    assert [await heavy.turn(200, 0.03) for _ in range(20)] == [10] * 20, "50 requests in 0.25 s"
+    assert [await light.turn(200, 0.03) for _ in range(20)] == [200] * 20
+    heavy.backlog.end_slice(32, 0.16, queued=30)
+    assert await heavy.turn(10, 0.01) == 10
+    assert await heavy.turn(200, 0.03) == 20, "the queue has not become short"
+    heavy.backlog.end_slice(32, 0.16, queued=20)
+    assert await heavy.turn(1, 0.01) == 1
+    assert await heavy.turn(200, 0.03) == 200, "the time starts again"
+
+
 async def test_occasional_bursts_are_not_shed() -> None:
     loop = Loop()
     for _ in range(20):
