@@ -143,7 +143,7 @@ def _deadline(milliseconds: Any) -> float:
 
 
 class JsonObservations(NamedTuple):
-    """See `Observations`."""
+    """See `RequestRows`."""
 
     observations: list[Any]
     is_plain: bool
@@ -153,12 +153,12 @@ class JsonObservations(NamedTuple):
 
     @property
     def rows(self) -> int:
-        """See `Observations`."""
+        """See `RequestRows`."""
         return len(self.observations)
 
     @staticmethod
     def read(policy: LoadedPolicy, parts: Sequence["JsonObservations"]) -> Arrays:
-        """See `Observations`. Raises ObservationError, IllegalMask or BodyTooLarge."""
+        """See `RequestRows`. Raises ObservationError, IllegalMask or BodyTooLarge."""
         if len(parts) == 1:
             return policy.reader.read(parts[0].observations, parts[0].is_plain)
         return policy.reader.read([value for part in parts for value in part.observations], True, is_mixed=True)

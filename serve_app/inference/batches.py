@@ -19,7 +19,7 @@ from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.runtime.ray_serve import logger
 
 
-class Observations(Protocol):
+class RequestRows(Protocol):
     """The observations of a request, as its format has parsed them."""
 
     @property
@@ -76,7 +76,7 @@ Outcome = Answer | Exception | None
 GoOn = Callable[[Outcome], None]
 
 
-class Run(NamedTuple):
+class GraphRun(NamedTuple):
     """The run of one request. Awaiting it returns its outcome, or raises its error.
 
     What drives a coroutine by hand receives the run, and lets it wait for the end of the turn. A task does not wait.
@@ -84,10 +84,10 @@ class Run(NamedTuple):
 
     batches: "Batches"
     policy: LoadedPolicy
-    observations: Observations
+    observations: RequestRows
     options: ActionOptions
 
-    def __await__(self) -> Generator["Run", Answer | None, Answer | None]:
+    def __await__(self) -> Generator["GraphRun", Answer | None, Answer | None]:
         if asyncio.current_task() is None:
             return (yield self)
         outcome = self.now()
@@ -108,9 +108,9 @@ class Batches:
     """The runs that wait for the end of this turn."""
 
     def __init__(self) -> None:
-        self._waiting: list[tuple[Run, GoOn]] = []
+        self._waiting: list[tuple[GraphRun, GoOn]] = []
 
-    def add(self, run: Run, loop: asyncio.AbstractEventLoop, go_on: GoOn) -> None:
+    def add(self, run: GraphRun, loop: asyncio.AbstractEventLoop, go_on: GoOn) -> None:
         """Do a run at the end of this turn, and call `go_on` with its outcome."""
         if not self._waiting:
             loop.call_soon(self.flush)
@@ -119,7 +119,7 @@ class Batches:
     def flush(self) -> None:
         """Do the runs now."""
         waiting, self._waiting = self._waiting, []
-        groups: dict[tuple[Any, ...], list[tuple[Run, GoOn]]] = {}
+        groups: dict[tuple[Any, ...], list[tuple[GraphRun, GoOn]]] = {}
         for run, go_on in waiting:
             groups.setdefault((run.policy, run.options, type(run.observations)), []).append((run, go_on))
         for (policy, *_), group in groups.items():
@@ -132,7 +132,7 @@ class Batches:
                         logger.error("an answer failed", exc_info=error)
 
 
-def _batches(group: list[tuple[Run, GoOn]], rows: int) -> Iterator[list[tuple[Run, GoOn]]]:
+def _batches(group: list[tuple[GraphRun, GoOn]], rows: int) -> Iterator[list[tuple[GraphRun, GoOn]]]:
     """Divide runs into batches of at most `rows` rows. No run has more."""
     size, begin = 0, 0
     for place, (run, _) in enumerate(group):
@@ -143,7 +143,7 @@ def _batches(group: list[tuple[Run, GoOn]], rows: int) -> Iterator[list[tuple[Ru
     yield group[begin:]
 
 
-def _outcomes(runs: list[Run]) -> list[Outcome]:
+def _outcomes(runs: list[GraphRun]) -> list[Outcome]:
     """Run requests as a batch. If that fails, each is run alone."""
     policy, observations, options = runs[0][1:]
     rows = [run.observations.rows for run in runs]

@@ -62,7 +62,7 @@ class HttpRoute(ABC):
         self, scope: Scope, receive: Receive, send: Send, version: str, read: ReadBody = read_bytes
     ) -> None:
         """Read a request, or continue one that was started, and send the response. Raises LeagueError."""
-        begun, access, model = perf_counter_ns(), self.serving.access, scope["path_params"]["model"]
+        start, access, model = perf_counter_ns(), self.serving.access, scope["path_params"]["model"]
         with self.serving.admitted(self.api):
             if (started := scope.pop(STARTED, None)) is not None:
                 scope[BODY_READ] = True
@@ -72,7 +72,7 @@ class HttpRoute(ABC):
                 body = await read(scope, receive, self.serving.settings.max_body)
                 if len(body) > LARGE_BODY or turn != access.backlog.turn:
                     access.admit_body(scope.get(KEY), len(body))
-                reply = await self.answer(model, version, scope["headers"], body, begun)
+                reply = await self.answer(model, version, scope["headers"], body, start)
             if LOG_ENTRY in scope:
                 log_version(scope, model, reply.version)
             headers = [*reply.headers, (b"content-length", b"%d" % len(reply.body)), self._replica]

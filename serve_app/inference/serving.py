@@ -10,7 +10,7 @@ from time import perf_counter_ns
 from league.errors import Overloaded
 from league.policies.policy import Arrays
 from serve_app.access.access_control import AccessControl
-from serve_app.inference.batches import Answer, Batches, Observations, Run
+from serve_app.inference.batches import Answer, Batches, GraphRun, RequestRows
 from serve_app.live_versions.alias_slots import AliasSlots
 from serve_app.live_versions.policies import ActionOptions, LoadedPolicy
 from serve_app.live_versions.resolver import ModelResolver
@@ -54,7 +54,11 @@ class Serving:
             self.in_flight[api] -= 1
 
     async def act(
-        self, policy: LoadedPolicy, observations: Observations, options: ActionOptions, state: Arrays | None = None
+        self,
+        policy: LoadedPolicy,
+        observations: RequestRows,
+        options: ActionOptions,
+        state: Arrays | None = None,
     ) -> Answer:
         """Decode the observations of a request, choose actions, and mirror the request.
 
@@ -72,7 +76,7 @@ class Serving:
         can_share = options.seed is None and not (policy.state or options.analysis)
         is_small = observations.is_joinable and observations.rows <= policy.inline_rows
         is_joint = can_share and is_small and policy.model not in self.settings.unbatched
-        answer = await Run(self.batches, policy, observations, options) if is_joint else None
+        answer = await GraphRun(self.batches, policy, observations, options) if is_joint else None
         if answer is None:
             started = perf_counter_ns()
             if observations.is_large:

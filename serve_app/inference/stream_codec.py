@@ -42,7 +42,7 @@ class BinaryRequest(NamedTuple):
 
 
 class BinaryObservations(NamedTuple):
-    """See `Observations`. parts: the bytes of each input, in the order of the manifest, without recurrent state."""
+    """See `RequestRows`. parts: the bytes of each input, in the order of the manifest, without recurrent state."""
 
     parts: Sequence[bytes | memoryview]
     rows: int
@@ -51,7 +51,7 @@ class BinaryObservations(NamedTuple):
 
     @staticmethod
     def read(policy: LoadedPolicy, parts: Sequence["BinaryObservations"]) -> Arrays:
-        """See `Observations`. Raises ObservationError or IllegalMask."""
+        """See `RequestRows`. Raises ObservationError or IllegalMask."""
         inputs, rows = parts[0].parts, parts[0].rows
         if len(parts) > 1:
             inputs = [b"".join(inputs) for inputs in zip(*(part.parts for part in parts), strict=True)]

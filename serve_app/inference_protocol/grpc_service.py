@@ -161,7 +161,7 @@ class InferenceService:
                 body = await self._read(context, self._settings.max_body if rpc == INFER else MAX_CHANGE_BODY)
                 if len(body) > LARGE_BODY:
                     self._access.admit_body(key, len(body))
-                begun, request = perf_counter_ns(), cast(Any, parse(body, request_type))
+                start, request = perf_counter_ns(), cast(Any, parse(body, request_type))
                 model = request.model_name if rpc == INFER else getattr(request, "name", "")
                 self._access.check_model(key, rpc, model)
                 if rpc != INFER:
@@ -170,7 +170,7 @@ class InferenceService:
                 if max(len(request.inputs), len(request.outputs), len(request.raw_input_contents)) > FEW_TENSORS:
                     check_counts(request, policy)
                 write = partial(write_response, request, policy.number)
-                return await self._inference.infer(policy, read_request(request, len(body)), write, begun)
+                return await self._inference.infer(policy, read_request(request, len(body)), write, start)
         except LeagueError as error:
             self._inference.serving.metrics.count_error(f"/v2/models/{model}", error.code)
             raise

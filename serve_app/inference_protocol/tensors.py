@@ -55,7 +55,7 @@ Data = Sequence[Any] | bytes | memoryview
 
 
 class Inputs(NamedTuple):
-    """The inputs of a request with lists or recurrent state, or of a large one. See `Observations`."""
+    """The inputs of a request with lists or recurrent state, or of a large one. See `RequestRows`."""
 
     tensors: Sequence[RequestTensor]
     rows: int
@@ -64,7 +64,7 @@ class Inputs(NamedTuple):
 
     @staticmethod
     def read(policy: LoadedPolicy, parts: Sequence["Inputs"]) -> Arrays:
-        """See `Observations`. Raises ObservationError or IllegalMask."""
+        """See `RequestRows`. Raises ObservationError or IllegalMask."""
         (part,) = parts
         arrays = {tensor.name: _array(tensor, policy.inputs[tensor.name]) for tensor in part.tensors}
         if policy.is_masked:

@@ -26,7 +26,7 @@ from league.refs import CHAMPION
 from serve_app.access.access_control import ADMISSION, KEY_HEADER, Admission
 from serve_app.access.errors import ErrorHandlers
 from serve_app.codecs.request_limits import LARGE_BODY
-from serve_app.inference.batches import Run
+from serve_app.inference.batches import GraphRun
 from serve_app.inference.http_route import REPLICA, STARTED, HttpRoute, Reply
 from serve_app.routes.action import PATH_PREFIX, PATH_SUFFIX
 from serve_app.runtime.uvicorn_http import HttpProtocol
@@ -157,7 +157,7 @@ class InferenceQueue:
         except Exception as error:
             self._refuse(connection, error)
         else:
-            if isinstance(waits_for, Run):
+            if isinstance(waits_for, GraphRun):
                 waits_for.later(connection.loop, partial(self._advance, connection, steps))
             else:
                 cast(Scope, connection.scope)[STARTED] = steps, waits_for

@@ -12,7 +12,7 @@ from league.policies.policy import Actions, Arrays
 from league.registry.registry import Registry
 from league.settings import Storage
 from serve_app.inference.action_request import JsonObservations, parse_action_request
-from serve_app.inference.batches import Answer, Batches, Observations, Run
+from serve_app.inference.batches import Answer, Batches, GraphRun, RequestRows
 from serve_app.inference.stream_codec import BinaryObservations
 from serve_app.live_versions.policies import ActionOptions, ActionSelections, LoadedPolicy
 from serve_app.live_versions.version_cache import load
@@ -50,13 +50,13 @@ def binary(batch: list[Any]) -> BinaryObservations:
     return BinaryObservations([array.tobytes() for array in board_arrays(batch).values()], len(batch))
 
 
-def together(policy: LoadedPolicy, requests: Sequence[Observations], options: ActionOptions = DEFAULT) -> list[Any]:
+def together(policy: LoadedPolicy, requests: Sequence[RequestRows], options: ActionOptions = DEFAULT) -> list[Any]:
     """The outcomes of requests of one turn: actions, errors, or None."""
     waiting, outcomes = Batches(), list[Any]()
 
     async def run() -> None:
         for observations in requests:
-            Run(waiting, policy, observations, options).later(asyncio.get_running_loop(), outcomes.append)
+            GraphRun(waiting, policy, observations, options).later(asyncio.get_running_loop(), outcomes.append)
         await asyncio.sleep(0)
 
     asyncio.run(run())
@@ -102,7 +102,7 @@ def test_requests_are_one_batch_if_their_options_and_formats_are_equal(
     json = JsonObservations(request.observations, is_plain=True, is_joinable=True, is_large=False)
     runs = [(binary([BOARD]), DEFAULT), (binary([BOARD]), ActionOptions(explore=False)), (json, DEFAULT)]
     for observations, options in runs * 2:
-        Run(waiting, policy, observations, options).later(loop, Mock())
+        GraphRun(waiting, policy, observations, options).later(loop, Mock())
     waiting.flush()
     assert batches == [2, 2, 2]
     loop.call_soon.assert_called_once_with(waiting.flush)
@@ -113,7 +113,7 @@ def test_requests_are_one_batch_if_their_options_and_formats_are_equal(
 def test_a_task_does_not_wait_for_the_turn(policy: LoadedPolicy, batches: list[int]) -> None:
     async def run() -> Any:
         waiting = Batches()
-        return await Run(waiting, policy, binary([BOARD]), DEFAULT), waiting
+        return await GraphRun(waiting, policy, binary([BOARD]), DEFAULT), waiting
 
     answer, waiting = asyncio.run(run())
     assert (batches, answer.runs) == ([1], 1)
@@ -121,11 +121,11 @@ def test_a_task_does_not_wait_for_the_turn(policy: LoadedPolicy, batches: list[i
 
 
 def test_a_failing_answer_does_not_prevent_others(policy: LoadedPolicy) -> None:
-    waiting, loop, others = Batches(), Mock(), Mock()
-    for go_on in (others, Mock(side_effect=RuntimeError("a bug")), others):
-        Run(waiting, policy, binary([BOARD]), DEFAULT).later(loop, go_on)
+    waiting, loop, callback = Batches(), Mock(), Mock()
+    for go_on in (callback, Mock(side_effect=RuntimeError("a bug")), callback):
+        GraphRun(waiting, policy, binary([BOARD]), DEFAULT).later(loop, go_on)
     waiting.flush()
-    assert others.call_count == 2
+    assert callback.call_count == 2
 
 
 def test_a_slow_policy_occupies_the_event_loop_once(policy: LoadedPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
