@@ -141,7 +141,7 @@ class PolicyServer(ray_serve.AsgiReplica):
         """The application of this replica."""
         application = self._replica.application()
         serve_bypass.install(application, self._replica.settings.root_path)
-        uvicorn_http.install(self._replica.events.end, self._replica.plain)
+        uvicorn_http.install(self._replica.events.end, self._replica.inference_queue)
         uvicorn_websocket.install(self._replica.settings.max_body, self._replica.settings.max_incomplete)
         grpc_handlers.install(self._replica.inference_service)
         collect_rarely()
@@ -226,7 +226,9 @@ class Replica:
         self.inference = Inference(self.serving)
         # With an access log, the application answers all requests, and writes it.
         self.infer = InferRoute(self.inference, replica)
-        self.plain = None if self.access_log else InferenceQueue(self.action, self.infer, self.errors, replica)
+        self.inference_queue = (
+            None if self.access_log else InferenceQueue(self.action, self.infer, self.errors, replica)
+        )
         self.stream = StreamRoute(self.serving, replica, process.is_draining)
         self.simulate = SimulateRoute(self.models, self.access, settings, process.is_draining)
         self.reporter = MetricsReporter(self.connection, self.metrics, self.shadow, self._statistics, replica, settings)

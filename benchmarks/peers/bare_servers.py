@@ -54,7 +54,7 @@ def handler(home: Path) -> tuple[Any, Any]:
     uvicorn_websocket.install(settings.max_body, settings.max_incomplete)
     application = replica.application()
     collect_rarely()
-    return application, partial(HttpProtocol, replica.events.end, replica.plain)
+    return application, partial(HttpProtocol, replica.events.end, replica.inference_queue)
 
 
 def fastapi(home: Path) -> tuple[Any, Any]:

@@ -164,7 +164,7 @@ class JsonObservations(NamedTuple):
         return policy.reader.read([value for part in parts for value in part.observations], True, is_mixed=True)
 
 
-def observations_of(
+def json_observations(
     request: DecodedActionRequest, policy: LoadedPolicy, body: bytes, strings: int = 0
 ) -> JsonObservations:
     """The observations of a request, in a body with `strings` further strings. Raises BodyTooLarge."""

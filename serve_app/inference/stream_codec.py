@@ -68,7 +68,7 @@ def binary_array(port: Port, data: bytes | memoryview, rows: int) -> NDArray:
     return check(port.name, array, port.leaf)
 
 
-def observations_of(policy: LoadedPolicy, request: BinaryRequest) -> BinaryObservations:
+def binary_observations(policy: LoadedPolicy, request: BinaryRequest) -> BinaryObservations:
     """The observations of a request. Raises ObservationError."""
     if len(request.tensors) != (size := request.rows * sum(port.row_bytes for port in policy.observed)):
         parts = " + ".join(f"{port.row_bytes} {port.name}" for port in policy.observed)

@@ -22,21 +22,20 @@ from serve_app.access.api_keys import ApiKey
 from serve_app.access.errors import MalformedBody, status_of
 from serve_app.access.request_body import parse_json_object
 from serve_app.codecs.request_limits import LARGE_BODY
-from serve_app.inference import stream_codec
 from serve_app.inference.action_request import (
     KEYS,
     DecodedActionRequest,
     build_response,
     decode_state,
     encode_state,
-    observations_of,
+    json_observations,
     parse_action_request,
     parse_flag,
     pinned_version,
     reject_unknown_keys,
 )
 from serve_app.inference.serving import Serving
-from serve_app.inference.stream_codec import parse_request, write_actions
+from serve_app.inference.stream_codec import binary_observations, parse_request, write_actions
 from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.resolver import policy_ref
 from serve_app.live_versions.traffic_split import Headers, acting
@@ -123,7 +122,7 @@ class StreamSession:
         request = parse_action_request(document, self._serving.settings.max_batch)
         is_anew = reset is True or ("state" in document and document["state"] is None)
         policy, state = await self._select(request, is_anew, _resets(reset, request))
-        observations = observations_of(request, policy, data, len(stream_keys))
+        observations = json_observations(request, policy, data, len(stream_keys))
         answer = await self._serving.act(policy, observations, request.options, state)
         self._policy, self._state, self._is_batch = policy, answer.output.state, request.is_batch
         response = build_response(request, answer, policy)
@@ -137,7 +136,7 @@ class StreamSession:
         start = perf_counter_ns()
         request = parse_request(data, self._serving.settings.max_batch)
         policy, state = self._continue(request.rows, request.reset, request.resets)
-        observations = stream_codec.observations_of(policy, request)
+        observations = binary_observations(policy, request)
         answer = await self._serving.act(policy, observations, request.options, state)
         self._policy, self._state, self._is_batch = policy, answer.output.state, request.rows > 1
         message = StreamMessage(write_actions(policy, answer.actions), False)

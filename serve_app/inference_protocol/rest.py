@@ -263,7 +263,7 @@ class InferRoute(HttpRoute):
 
     async def answer(self, model: str, version: str, headers: Headers, body: bytes, begun: int) -> Reply:
         """See `HttpRoute`."""
-        header_length = framing(headers)
+        header_length = json_length(headers)
         policy = await self._inference.find(model, version, headers)
         head = body[:header_length] if header_length is not None and header_length <= MAX_HEAD else b""
         layout, inputs = self._layouts.get(policy, {}).get(head), None
@@ -298,8 +298,8 @@ class InferRoute(HttpRoute):
             layouts[head] = Layout(request, [tensors[port.name] for port in policy.observed], end, rows)
 
 
-def framing(headers: Headers) -> int | None:
-    """Inference-Header-Content-Length. Raises InvalidInput."""
+def json_length(headers: Headers) -> int | None:
+    """Inference-Header-Content-Length: bytes of the JSON if binary tensors follow it. Raises InvalidInput."""
     value = next((value for name, value in headers if name == HEADER_LENGTH), None)
     if value is not None and (not value.isdigit() or len(value) > LENGTH_DIGITS):
         raise InvalidInput("Inference-Header-Content-Length must be a number of bytes")

@@ -27,7 +27,7 @@ from serve_app.inference.action_request import (
     build_response,
     decode_state,
     encode_state,
-    observations_of,
+    json_observations,
     parse_action_request,
     pinned_version,
     reject_unknown_keys,
@@ -91,7 +91,7 @@ class ActionRoute(HttpRoute):
         if request.tokens is not None and any(request.tokens):
             version = pinned_version(request, model, version, await models.members(model, version))
         policy = await models.find(model, version, headers)
-        observations = observations_of(request, policy, body)
+        observations = json_observations(request, policy, body)
         answer = await self.serving.act(policy, observations, request.options, decode_state(request, policy))
         response = build_response(request, answer, policy)
         if (state := answer.output.state) is not None:

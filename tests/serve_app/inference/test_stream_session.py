@@ -31,8 +31,8 @@ from serve_app.inference.stream_codec import (
     REQUEST,
     RESPONSE,
     BinaryRequest,
+    binary_observations,
     encode_request,
-    observations_of,
     parse_request,
     write_actions,
 )
@@ -461,7 +461,7 @@ def request_data(draw: st.DrawFn) -> dict[str, Any]:
 
 
 def decode(policy: LoadedPolicy, request: BinaryRequest) -> Arrays:
-    observations = observations_of(policy, request)
+    observations = binary_observations(policy, request)
     return observations.read(policy, [observations])
 
 

@@ -398,7 +398,7 @@ def test_the_application_answers_pages_of_other_origins(storage: Storage) -> Non
     headers = [(b"content-length", b"2"), (b"content-type", b"application/json")]
     for origins, takes in (([], True), (["https://game.example"], False)):
         settings = QUICK.model_copy(update={"cors_origins": origins})
-        plain = Replica(Registry.open(storage), settings, "replica-1").plain
+        plain = Replica(Registry.open(storage), settings, "replica-1").inference_queue
         assert plain is not None
         assert plain.takes(b"/v1/policies/board/action", headers)
         assert plain.takes(b"/v1/policies/board/action", [*headers, (b"origin", b"https://game.example")]) is takes

@@ -51,7 +51,7 @@ class Connections:
 
     async def _run(self) -> None:
         self.loop, self._end = asyncio.get_running_loop(), asyncio.Event()
-        plain = self.server.plain
+        plain = self.server.inference_queue
         assert plain is not None
         reply = plain._reply
 
