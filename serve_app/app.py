@@ -304,13 +304,13 @@ class Replica:
                 if self._search_client is not None:
                     await running.enter_async_context(self._search_client.running())
                 await running.enter_async_context(self.watcher.watching())
+                running.enter_context(self.shadow.comparing())
                 await running.enter_async_context(self.reporter.reporting())
                 await running.enter_async_context(self.events.watching())
                 await running.enter_async_context(self.stream.checking())
                 await running.enter_async_context(self._evaluations.running())
                 yield
         finally:
-            self.shadow.close()
             self.models.close()
             self.connection.close()
             self.registry.close()

@@ -21,13 +21,12 @@ TURN = 0.05
 class _Run:
     """A run, in progress or to be reused: options are expensive to create."""
 
-    __slots__ = ("first_turn", "limit", "options", "owner")
+    __slots__ = ("first_turn", "limit", "options")
 
     first_turn: int
     """The turn in which it began."""
     limit: float
     """Turns after which it is ended."""
-    owner: object
 
     def __init__(self) -> None:
         self.options = onnxruntime.RunOptions()
@@ -58,45 +57,29 @@ def open_session(graph: bytes) -> Any:
     return onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
 
 
-def run_graph(
-    session: Any, outputs: list[str], feed: dict[str, NDArray], seconds: float, owner: object | None = None
-) -> Any:
+def run_graph(session: Any, outputs: list[str], feed: dict[str, NDArray], seconds: float) -> Any:
     """Return the outputs of a session from `open_session`.
 
-    owner: `end_runs` ends its runs.
-
     Raises:
-        GraphTimeout: It did not finish within `seconds`, or was ended.
+        GraphTimeout: It did not finish within `seconds`.
         Exception: What ONNX Runtime raises.
     """
     try:
-        run = _idle.pop() if owner is None else _Run()
+        run = _idle.pop()
     except IndexError:
         run = _Run()
-    run.first_turn, run.limit, run.owner = _turn, 1 + seconds / TURN, owner
+    run.first_turn, run.limit = _turn, 1 + seconds / TURN
     _runs.add(run)
     try:
         return session.run(outputs, feed, run.options)
     except Exception:
         if run.options.terminate:
-            reason = f"did not finish within {seconds:g} s" if _is_over(run) else "was ended"
-            raise GraphTimeout(f"a run of the graph {reason}") from None
+            raise GraphTimeout(f"a run of the graph did not finish within {seconds:g} s") from None
         raise
     finally:
         _runs.discard(run)
-        if owner is None and _turn + 1 - run.first_turn < run.limit:
+        if _turn + 1 - run.first_turn < run.limit:
             _idle.append(run)
-
-
-def end_runs(owner: object) -> None:
-    """End the runs of an owner, which are in other threads."""
-    for run in tuple(_runs):
-        if run.owner is owner:
-            run.options.terminate = True
-
-
-def _is_over(run: _Run) -> bool:
-    return _turn - run.first_turn >= run.limit
 
 
 def _watch() -> None:
@@ -105,5 +88,5 @@ def _watch() -> None:
         sleep(TURN)
         _turn += 1
         for run in tuple(_runs):
-            if _is_over(run):
+            if _turn - run.first_turn >= run.limit:
                 run.options.terminate = True

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from league.errors import ArtifactCorrupt, EnvironmentMismatch, GraphTimeout, ObservationError, one_line
 from league.policies.actions import dist_inputs_size, to_environment
 from league.policies.draws import Generators, UniformNumbers, certain, sample
-from league.policies.graph_runs import end_runs, open_session, run_graph
+from league.policies.graph_runs import open_session, run_graph
 from league.policies.policy import Actions, Arrays
 from league.registry.storage.manifest import PolicyManifest
 from league.spaces import OBSERVATION, Discrete, Space
@@ -58,7 +58,6 @@ class OnnxPolicy:
         self._outputs = {node.name: node for node in self._session.get_outputs()}
         _check_graph(self._inputs, self._outputs, manifest)
         self.has_distribution, self._timeout = has_distribution, timeout
-        self._owner: object | None = None
         self._action = manifest.action if manifest else _discrete(self._outputs)
         self._observed = tuple(name for name in self._inputs if not name.startswith(STATE_IN))
         self._recurrent = tuple(name for name in self._inputs if name.startswith(STATE_IN))
@@ -120,23 +119,18 @@ class OnnxPolicy:
                 feed |= self.initial_state(len(feed[self._observed[0]])) if state is None else state
             if len({len(array) for array in feed.values()}) != 1:
                 raise ValueError(f"rows differ: { {name: len(array) for name, array in feed.items()} }")
-            return run_graph(self._session, outputs, feed, self._timeout, self._owner)
+            return run_graph(self._session, outputs, feed, self._timeout)
         except GraphTimeout:
             raise
         except Exception as error:
             self._explain(observations, state)
             raise ObservationError(f"the graph does not accept its input: {one_line(error)}") from error
 
-    def within(self, timeout: float, can_end: bool = False) -> Self:
-        """Return the same policy with another timeout in seconds. can_end: whether `end_runs` ends its runs."""
+    def within(self, timeout: float) -> Self:
+        """Return the same policy with another timeout in seconds."""
         policy = copy(self)
-        policy._timeout, policy._owner = timeout, object() if can_end else None
+        policy._timeout = timeout
         return policy
-
-    def end_runs(self) -> None:
-        """End the runs of this object in other threads: they raise GraphTimeout."""
-        assert self._owner is not None, "within(…, can_end=True) returns policies whose runs can be ended"
-        end_runs(self._owner)
 
     def initial_state(self, batch: int) -> dict[str, NDArray]:
         """Return the recurrent state at the start of `batch` episodes; empty for graphs without state."""

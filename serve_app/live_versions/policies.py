@@ -143,7 +143,7 @@ class LoadedPolicy:
     inline_graph: Graph = field(init=False)
     """The graph for runs on the event loop."""
     shadow_graph: Graph = field(init=False)
-    """The graph for runs of a shadow, which can be ended."""
+    """The graph for runs of a shadow."""
     _threads: asyncio.Semaphore = field(init=False)
 
     def __post_init__(self, is_only: bool) -> None:
@@ -155,7 +155,7 @@ class LoadedPolicy:
         self.limits = RequestLimits.of(port.leaf for port in self.inputs.values())
         self._threads = asyncio.Semaphore(SEARCHES if self.search is not None else RUNS_IN_THREADS)
         self.inline_graph = self.graph.within(INLINE_TIMEOUT)
-        self.shadow_graph = self.graph.within(SHADOW_TIMEOUT, can_end=True)
+        self.shadow_graph = self.graph.within(SHADOW_TIMEOUT)
 
     @property
     def qualified(self) -> str:

@@ -201,7 +201,6 @@ class RemoteSearch:
         self._client, self._timeout = client, timeout
         self._version, self._policy, self._action = (version.league, version.number, version.sha256), policy, action
         self._deadline, self._with_lines, self._queue = math.inf, False, CallQueue()
-        self._calls: set[concurrent.futures.Future[dict[str, Any]]] = set()
 
     @property
     def threads(self) -> ThreadPoolExecutor:
@@ -225,7 +224,7 @@ class RemoteSearch:
 
         Raises:
             ObservationError: An observation is not a position of the game.
-            GraphTimeout: It took too long, or was ended.
+            GraphTimeout: It took too long.
             LeagueError: What `SearchClient.search` raises.
         """
 
@@ -239,14 +238,7 @@ class RemoteSearch:
         rows = len(next(iter(observations.values())))
         queue = self._queue if rows <= SHARED_ROWS else CallQueue()
         call = self._client.search(queue, arguments, self._timeout)
-        self._calls.add(call)
-        try:
-            fields = call.result()
-        except concurrent.futures.CancelledError:
-            raise GraphTimeout("the search was ended") from None
-        finally:
-            self._calls.discard(call)
-        return SearchedActions.of(fields, self._action, explore, rng)
+        return SearchedActions.of(call.result(), self._action, explore, rng)
 
     def distribution(self, observations: Arrays, *, state: Arrays | None = None) -> SearchedActions:
         """The same as `act` without `explore`."""
@@ -256,10 +248,10 @@ class RemoteSearch:
         """The same as `act` without `explore`."""
         return self.act(observations, state=state)
 
-    def within(self, timeout: float, can_end: bool = False) -> Self:  # noqa: ARG002
+    def within(self, timeout: float) -> Self:
         """See `OnnxPolicy.within`."""
         policy = copy(self)
-        policy._timeout, policy._queue, policy._calls = timeout, CallQueue(), set()
+        policy._timeout, policy._queue = timeout, CallQueue()
         return policy
 
     def bounded(self, deadline: float, with_lines: bool = False) -> Self:
@@ -272,8 +264,3 @@ class RemoteSearch:
         if deadline < math.inf:  # the other searches of a message may take longer
             policy._queue = CallQueue()
         return policy
-
-    def end_runs(self) -> None:
-        """End the searches of this object in other threads: they raise GraphTimeout."""
-        for call in tuple(self._calls):
-            call.cancel()

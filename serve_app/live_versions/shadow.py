@@ -3,25 +3,24 @@
     request → champion → response
                  ↘ bounded queue → thread: candidate → same action? latency? → counts
 
-A run that takes long, or continues after the shadow was switched off, is ended.
-
-Callers are unaffected. Requests are batched in a thread that pauses between batches to stay within its share of a core;
-requests that exceed it are dropped and counted. The first request of a batch runs alone and is timed in CPU time, so
-that neither other requests nor waiting for the GIL count as the candidate's latency.
+Callers are unaffected. The thread compares one request after the other, and pauses to stay within its share of a core;
+requests that exceed it are dropped and counted. Runs are timed in CPU time, so that neither other requests nor waiting
+for the GIL count as the candidate's latency, and those that take long are ended.
 """
 
-import asyncio
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from queue import SimpleQueue
 from random import random
-from time import thread_time_ns
-from typing import Any, NamedTuple
+from threading import Thread
+from time import sleep, thread_time_ns
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from league.errors import GraphTimeout, one_line
+from league.errors import one_line
 from league.histograms import Histogram
 from league.policies.policy import Actions, Arrays
 from league.policies.probes import same
@@ -34,27 +33,18 @@ from serve_app.live_versions.traffic_split import TrafficSplit, acting
 from serve_app.runtime.ray_serve import logger
 from serve_app.settings import ServeSettings
 
-BATCH_WINDOW = 0.05
-"""Seconds for which requests are collected. Fewer wake-ups take less time from the event loop."""
+PAUSE = 0.05
+"""Seconds of a pause at least, in which requests are collected. Fewer wake-ups take less time from the event loop."""
+SLICE = 0.005
+"""Seconds of CPU time after which the thread pauses although requests wait."""
 TOLERANCE = 0.01
 """Continuous actions are equal if they differ by less than this share of their range."""
 MAX_WAITING_BYTES = 16 * 2**20
 """Maximum size of queued observations."""
-MAX_ROWS = 256
-"""Maximum observations per batch, unless one request has more."""
 
 MirrorFunction = Callable[[Arrays, Arrays | None, NDArray | None], None]
 """Takes the observations of a request, its recurrent state, and the champion's greedy actions, or None if they were
 sampled."""
-
-
-class MirroredRequest(NamedTuple):
-    """A queued request."""
-
-    candidate: LoadedVersion
-    champion: LoadedPolicy
-    observations: Arrays
-    actions: NDArray | None
 
 
 @dataclass(slots=True)
@@ -70,66 +60,63 @@ class Tally:
     latency: Histogram = field(default_factory=Histogram)
 
 
-@dataclass(slots=True)
-class ShadowResult:
-    """The result of requests for one policy of one candidate and champion."""
+class MirroredRequest(NamedTuple):
+    """A queued request."""
 
-    pair: tuple[str, int, int]
-    requests: int = 0
-    observations: int = 0
-    agreed: int = 0
-    failed: int = 0
-    ns: int | None = None
-    """CPU time of a request that ran alone, of a search that of the search service."""
-    searched_ns: int = 0
-    """CPU time of the search service."""
-    fault: str | None = None
-    is_late: bool = False
-    """Whether a run was ended."""
+    shadow: LoadedVersion
+    candidate: LoadedVersion
+    """The shadow, or a member of it."""
+    champion: LoadedPolicy
+    observations: Arrays
+    actions: NDArray | None
+    size: int
+    """Bytes of the observations."""
+    counts: Tally
 
 
 class Shadow:
-    """Mirrors requests to candidates. All methods run on the event loop."""
+    """Mirrors requests to candidates. Its methods run on the event loop."""
 
     def __init__(self, slots: AliasSlots, traffic: TrafficSplit, settings: ServeSettings) -> None:
         self._slots = slots
         self._traffic = traffic
         self._settings = settings
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="shadow")
         self._counts: dict[tuple[str, int, int], Tally] = {}
-        self._waiting: list[MirroredRequest] = []
-        self._bytes = 0
-        self._is_scheduled = False
+        self._queue = SimpleQueue[MirroredRequest | None]()
+        # Each is changed by one thread.
+        self._mirrored_bytes = self._compared_bytes = 0
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes of the observations that are not yet compared."""
+        return self._mirrored_bytes - self._compared_bytes
 
     def mirror_for(self, policy: LoadedPolicy) -> MirrorFunction | None:
         """The function that mirrors a request that `policy` answers; None if it is not mirrored."""
         target = self._traffic.shadows.get(policy.league)
         if target is None or (target.share < 1 and random() >= target.share):
             return None
-        candidate, champion = self._slots.get(policy.league, target.slot), self._slots.champion(policy.league)
-        if candidate is None or champion is None or candidate is champion:
+        shadow, champion = self._slots.get(policy.league, target.slot), self._slots.champion(policy.league)
+        if shadow is None or champion is None or shadow is champion:
             return None
         if all(version.policies.get(policy.name) is not policy for version in (champion, *champion.members)):
             return None
-        candidate = acting(candidate, ())
+        candidate = acting(shadow, ())
         if candidate.policies.get(policy.name) is policy:
             return None
 
         def mirror(observations: Arrays, state: Arrays | None, actions: NDArray | None) -> None:
-            request = MirroredRequest(candidate, policy, observations, actions)
-            counts = self._counts_of(_pair(request))
+            counts = self._counts.setdefault((policy.league, candidate.number, policy.number), Tally())
             if state is not None:  # it would be another network's
                 counts.skipped += 1
                 return
             size = sum(array.nbytes for array in observations.values())
-            if len(self._waiting) >= self._settings.shadow_waiting or self._bytes + size > MAX_WAITING_BYTES:
+            is_full = self._queue.qsize() >= self._settings.shadow_waiting
+            if is_full or self.waiting_bytes + size > MAX_WAITING_BYTES:
                 counts.dropped += 1
                 return
-            self._waiting.append(request)
-            self._bytes += size
-            if not self._is_scheduled:
-                self._is_scheduled = True
-                asyncio.get_running_loop().call_later(BATCH_WINDOW, self._start_batch)
+            self._mirrored_bytes += size
+            self._queue.put(MirroredRequest(shadow, candidate, policy, observations, actions, size, counts))
 
         return mirror
 
@@ -150,114 +137,55 @@ class Shadow:
             for pair, counts in sorted(self._counts.items())
         ]
 
-    def close(self) -> None:
-        """Stop the thread."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
-
-    def _start_batch(self) -> None:
-        requests, self._waiting, self._bytes = self._waiting, [], 0
-        if not requests:
-            self._is_scheduled = False
-            return
-        loop = asyncio.get_running_loop()
-        candidates = list({id(request.candidate): request.candidate for request in requests}.values())
+    @contextmanager
+    def comparing(self) -> Iterator[None]:
+        """Compare mirrored requests while the context is active."""
+        Thread(target=self._compare_all, name="shadow", daemon=True).start()
         try:
-            computing = loop.run_in_executor(self._thread, compare, requests)
-        except RuntimeError:  # closed in the meantime
-            return
-        computing.add_done_callback(self._finish_batch)
-        self._end_if_off(computing, candidates)
+            yield
+        finally:
+            self._queue.put(None)
 
-    def _end_if_off(self, computing: asyncio.Future[Any], candidates: Sequence[LoadedVersion]) -> None:
-        """End the runs of versions that are no longer shadows, until the batch is finished."""
-        if computing.done():
-            return
-        for candidate in candidates:
-            target = self._traffic.shadows.get(candidate.league)
-            shadow = None if target is None else self._slots.get(candidate.league, target.slot)
-            if shadow is None or all(candidate is not version for version in (shadow, *shadow.members)):
-                for policy in candidate.policies.values():
-                    policy.shadow_graph.end_runs()
-        asyncio.get_running_loop().call_later(BATCH_WINDOW, self._end_if_off, computing, candidates)
-
-    def _finish_batch(self, computing: asyncio.Future[tuple[list[ShadowResult], float]]) -> None:
-        if computing.cancelled():
-            return
-        outcomes, seconds = computing.result()
-        for outcome in outcomes:
-            counts = self._counts_of(outcome.pair)
-            if outcome.fault is not None and not counts.failed:
-                logger.error("%s@%d failed to answer a mirrored request: %s", *outcome.pair[:2], outcome.fault)
-            counts.requests += outcome.requests
-            counts.observations += outcome.observations
-            counts.agreed += outcome.agreed
-            counts.failed += outcome.failed
-            if outcome.ns is not None:
-                counts.latency.add(outcome.ns)
-        pause = max(BATCH_WINDOW, seconds * (1 / self._settings.shadow_load - 1))
-        asyncio.get_running_loop().call_later(pause, self._start_batch)
-
-    def _counts_of(self, pair: tuple[str, int, int]) -> Tally:
-        if (counts := self._counts.get(pair)) is None:
-            counts = self._counts[pair] = Tally()
-        return counts
+    def _compare_all(self) -> None:
+        seconds = 0.0
+        while (request := self._queue.get()) is not None:
+            target = self._traffic.shadows.get(request.shadow.league)
+            if target is not None and self._slots.get(request.shadow.league, target.slot) is request.shadow:
+                seconds += _compare(request)
+            else:  # Its runs may be slow, and those of another shadow wait.
+                request.counts.dropped += 1
+            self._compared_bytes += request.size
+            if seconds >= SLICE or self._queue.empty():
+                sleep(max(PAUSE, seconds * (1 / self._settings.shadow_load - 1)))
+                seconds = 0.0
 
 
-def compare(requests: Sequence[MirroredRequest]) -> tuple[list[ShadowResult], float]:
-    """Run candidates on requests; returns the results and the CPU time in seconds."""
-    start = thread_time_ns()
-    alike: dict[tuple[int, int], list[MirroredRequest]] = {}
-    for request in requests:
-        alike.setdefault((id(request.candidate), id(request.champion)), []).append(request)
-    outcomes = []
-    for group in alike.values():
-        first, later_requests = group[:1], group[1:]
-        outcomes.append(_compare_batch(first, is_timed=True))
-        if outcomes[-1].is_late:
-            outcomes.append(replace(outcomes[-1], failed=len(later_requests)))
-            continue
-        outcomes += [_compare_batch(part, is_timed=False) for part in _batches(later_requests)]
-    return outcomes, (thread_time_ns() - start + sum(outcome.searched_ns for outcome in outcomes)) / 1e9
-
-
-def _batches(requests: Sequence[MirroredRequest]) -> list[list[MirroredRequest]]:
-    """Requests in batches of at most MAX_ROWS, in order."""
-    parts: list[list[MirroredRequest]] = []
-    rows = MAX_ROWS
-    for request in requests:
-        if (rows := rows + _rows(request)) > MAX_ROWS:
-            parts.append([])
-            rows = _rows(request)
-        parts[-1].append(request)
-    return parts
-
-
-def _compare_batch(requests: Sequence[MirroredRequest], is_timed: bool) -> ShadowResult:
-    outcome = ShadowResult(_pair(requests[0]))
+def _compare(request: MirroredRequest) -> float:
+    """Run the candidate, and count the result. Returns seconds of CPU time."""
+    champion, observations, expected, counts = request.champion, request.observations, request.actions, request.counts
+    start, searched_ns = thread_time_ns(), 0
     try:
-        champion = requests[0].champion
-        candidate = requests[0].candidate.policy(champion.name)
-        names = requests[0].observations
-        observations = {name: np.concatenate([request.observations[name] for request in requests]) for name in names}
-        seeds = np.random.default_rng().integers(2**63, size=sum(map(_rows, requests)))
-        start = thread_time_ns()
+        candidate = request.candidate.policy(champion.name)
+        rows = len(next(iter(observations.values())))
+        seeds = np.random.default_rng().integers(2**63, size=rows)
         answer = _act(candidate, candidate.shadow_graph, observations, seeds)
-        actions, searched_ns = answer.actions, answer.ns if isinstance(answer, SearchedActions) else 0
+        searched_ns = answer.ns if isinstance(answer, SearchedActions) else 0
         cpu_ns = thread_time_ns() - start + searched_ns
-        recorded = [request.actions for request in requests if request.actions is not None]
         # The champion's actions are recomputed if they were or are to be sampled.
-        if champion.samples or len(recorded) < len(requests):
+        if champion.samples or expected is None:
             expected = _act(champion, champion.graph, observations, seeds).actions
-        else:
-            expected = np.concatenate(recorded)
-        outcome.agreed = int(same(actions, expected, candidate.manifest.action, TOLERANCE).sum())
+        agreed = int(same(answer.actions, expected, candidate.manifest.action, TOLERANCE).sum())
     except Exception as error:  # any failure is counted against the candidate
-        outcome.is_late = isinstance(error, GraphTimeout)
-        outcome.failed, outcome.fault = len(requests), one_line(error, with_type=True)
-        return outcome
-    outcome.requests, outcome.observations, outcome.searched_ns = len(requests), len(actions), searched_ns
-    outcome.ns = cpu_ns if is_timed else None
-    return outcome
+        if not counts.failed:
+            name = f"{request.candidate.league}@{request.candidate.number}"
+            logger.error("%s failed to answer a mirrored request: %s", name, one_line(error, with_type=True))
+        counts.failed += 1
+    else:
+        counts.latency.add(cpu_ns)
+        counts.agreed += agreed
+        counts.observations += rows
+        counts.requests += 1
+    return (thread_time_ns() - start + searched_ns) / 1e9
 
 
 def _act(policy: LoadedPolicy, graph: Graph, observations: Arrays, seeds: NDArray[np.int64]) -> Actions:
@@ -265,11 +193,3 @@ def _act(policy: LoadedPolicy, graph: Graph, observations: Arrays, seeds: NDArra
     if not policy.samples:
         return graph.act(observations)
     return graph.act(observations, explore=True, rng=generators(seeds))
-
-
-def _rows(request: MirroredRequest) -> int:
-    return len(next(iter(request.observations.values())))
-
-
-def _pair(request: MirroredRequest) -> tuple[str, int, int]:
-    return request.champion.league, request.candidate.number, request.champion.number

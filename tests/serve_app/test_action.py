@@ -441,9 +441,9 @@ FULL = BOARD | {"observation": np.ones((6, 7, 2), int).tolist()}
 def _impatience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Limits of runs that do not end are a 600th. All others need no limit, however busy the machine is."""
 
-    def run_impatiently(session: Any, outputs: list[str], feed: dict[str, NDArray], seconds: float, owner: Any) -> Any:
+    def run_impatiently(session: Any, outputs: list[str], feed: dict[str, NDArray], seconds: float) -> Any:
         is_endless = feed.get("observation", np.zeros(1)).sum() == ENDLESS
-        return run_graph(session, outputs, feed, seconds / 600 if is_endless else seconds, owner)
+        return run_graph(session, outputs, feed, seconds / 600 if is_endless else seconds)
 
     monkeypatch.setattr(onnx, "run_graph", run_impatiently)
 

@@ -297,7 +297,7 @@ def _reply(case: StreamCase, stream: ClientConnection) -> Answer:
 def counts(side: Side) -> Answer:
     """What a replica has counted: requests, observations and errors, and requests of canaries and shadows."""
     server = side.connections.server
-    until(lambda: not server.shadow._is_scheduled)
+    until(lambda: not server.shadow.waiting_bytes)
 
     async def report() -> dict[str, Any]:
         documents = server.inference.statistics.documents()
