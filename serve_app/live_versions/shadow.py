@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from queue import SimpleQueue
-from random import random
+from random import random, randrange
 from threading import Thread
 from time import sleep, thread_time_ns
 from typing import NamedTuple
@@ -167,7 +167,7 @@ def _compare(request: MirroredRequest) -> float:
     try:
         candidate = request.candidate.policy(champion.name)
         rows = len(next(iter(observations.values())))
-        seeds = np.random.default_rng().integers(2**63, size=rows)
+        seeds = randrange(2**62) + np.arange(rows)
         answer = _act(candidate, candidate.shadow_graph, observations, seeds)
         searched_ns = answer.ns if isinstance(answer, SearchedActions) else 0
         cpu_ns = thread_time_ns() - start + searched_ns

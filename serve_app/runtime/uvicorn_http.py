@@ -1,5 +1,5 @@
-"""uvicorn's HTTP protocol with batched accepts, responses sent as one write, notification of shutdown, the length
-of the accept queue, and limits for idle connections.
+"""uvicorn's HTTP protocol with batched accepts, notification of shutdown, the length of the accept queue, and limits
+for idle connections.
 
 uvloop accepts one connection per turn of the event loop, and a turn handles the requests of all open connections. If
 many clients connect at once with slow requests, the last one would wait for a long time. Therefore each new
@@ -33,8 +33,6 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 from uvicorn.protocols.http import auto
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.server import ServerState
-
-from serve_app.runtime.joined_writes import JoinedWrites
 
 OF_ONE_ADDRESS, CROWDED = 1 / 8, 1 / 4
 """Shares of the file descriptors of this process: connections of one address of another machine, and open connections
@@ -201,10 +199,8 @@ class HttpProtocol(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Start this connection, and accept those that wait."""
         super().connection_made(cast(asyncio.Transport, transport))
-        self._joined = JoinedWrites(self.transport, self.loop.call_soon)
-        self.transport = cast(asyncio.Transport, self._joined)
         if not self._is_admitted():
-            self._joined.transport.abort()
+            self.transport.abort()
             return
         self._first_request = self.loop.call_later(FIRST_REQUEST, self.transport.close)
         if self.server is None or self.server[1] is None:
@@ -289,10 +285,9 @@ class HttpProtocol(HttpToolsProtocol):
         """Send the response to a plain request. head: its header lines and an empty line."""
         self.is_waiting, self.body = False, b""
         if not self.transport.is_closing():
-            self._joined.flush()
             default = _header_lines(self.server_state.default_headers)
-            self._joined.transport.write(b"".join((STATUS_LINE[status], default, head, body)))
-            super().on_response_complete()
+            self.transport.write(b"".join((STATUS_LINE[status], default, head, body)))
+            self.on_response_complete()
 
     def pass_on(self) -> None:
         """Let the application answer a plain request."""
@@ -324,15 +319,8 @@ class HttpProtocol(HttpToolsProtocol):
         self.transport.write(MALFORMED)
         self.transport.close()
 
-    def on_response_complete(self) -> None:
-        """Send the response."""
-        self._joined.flush()
-        super().on_response_complete()
-
     def handle_websocket_upgrade(self) -> None:
         """Hand over the connection."""
-        self._joined.flush()
-        self.transport = self._joined.transport
         self._release()
         super().handle_websocket_upgrade()
 
