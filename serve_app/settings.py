@@ -62,15 +62,9 @@ class ServeSettings(BaseModel):
     run_timeout: float = Field(default=3.0, gt=0)
     """How long a run of a policy's graph may occupy a thread of the replica. It is then ended, after its current
     operator, and the request gets 504. Less than `timeout`, so that the request is not answered before."""
-    max_waiting: int = Field(default=1024, ge=1)
-    """Inference requests that may wait on the event loop, including those on connections that are not accepted yet. If
-    more wait for longer than `burst_tolerance`, or more than are answered in about 0.25 s, the excess is refused with
-    429."""
-    max_turn: float = Field(default=0.025, gt=0)
-    """The corresponding time limit: if turns of the event loop take longer for more than `burst_tolerance`, requests
-    that a turn reaches later than this are refused with 429. An accepted request waits for at most two turns."""
-    burst_tolerance: float = Field(default=0.1, ge=0)
-    """How long a burst may exceed `max_waiting` or `max_turn`."""
+    max_wait: float = Field(default=0.25, gt=0)
+    """How long an inference request may wait for others before it starts, nearly; those that would wait for longer are
+    refused with 429."""
     require_keys: Literal["auto", "always", "never"] = "auto"
     """Whether requests need an API key. `auto`: if the registry has a key, or the server listens to other machines.
     `never` is set by `league serve --insecure`. Changes of what is served always need a key."""

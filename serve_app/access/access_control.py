@@ -66,9 +66,8 @@ class AccessControl:
         self._permissions = permissions
         self._settings = settings
         self._is_exposed = is_exposed
-        self.backlog = Backlog(settings.max_waiting, settings.max_turn, settings.burst_tolerance)
+        self.backlog = Backlog(settings.max_wait)
         self._frames = TokenBucket(FRAMES)
-        self._is_first = True
 
     @property
     def requires_key(self) -> bool:
@@ -102,9 +101,6 @@ class AccessControl:
 
         Raises UntrustedHost, CrossSiteRequest, and the errors of `admit`.
         """
-        if self._is_first and (server := scope.get("server")):
-            self._is_first = False
-            self.backlog.watch_port(server[1])
         headers, method = _read_headers(scope["headers"]), scope.get("method", "GET")
         need = self._permissions.for_request(scope["type"], method, path)
         if self.is_local_only:
@@ -133,9 +129,9 @@ class AccessControl:
         return 0.0 if bucket is None else bucket.take()
 
     def admit_body(self, key: ApiKey | None, size: int) -> None:
-        """Accept a body that is large, or that arrived in a later turn of the event loop than its request.
+        """Accept a body, which may have arrived later than its request.
 
-        A body counts as one more request of its key per LARGE_BODY bytes. Raises RateLimited or Overloaded.
+        It counts as one more request of its key per LARGE_BODY bytes. Raises RateLimited or Overloaded.
         """
         if key is not None and key.bucket is not None and (wait := key.bucket.owe(size // LARGE_BODY)):
             raise _rate_limited(key, key.bucket, wait)

@@ -10,7 +10,6 @@ from starlette.types import Receive, Scope, Send
 from serve_app.access.access_control import KEY
 from serve_app.access.access_log import LOG_ENTRY, log_version
 from serve_app.access.request_body import BODY_READ, read_bytes
-from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference.serving import Serving
 from serve_app.live_versions.traffic_split import Headers
 from serve_app.runtime.timeouts import resume
@@ -68,10 +67,8 @@ class HttpRoute(ABC):
                 scope[BODY_READ] = True
                 reply: Reply = await resume(*started)
             else:
-                turn = access.backlog.turn
                 body = await read(scope, receive, self.serving.settings.max_body)
-                if len(body) > LARGE_BODY or turn != access.backlog.turn:
-                    access.admit_body(scope.get(KEY), len(body))
+                access.admit_body(scope.get(KEY), len(body))
                 reply = await self.answer(model, version, scope["headers"], body, start)
             if LOG_ENTRY in scope:
                 log_version(scope, model, reply.version)

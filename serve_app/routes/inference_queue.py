@@ -7,9 +7,9 @@ started one after the other, and wait for their runs, which are done as one batc
 continues in the application. So do those that never come here: large bodies, and unusual headers. A request is admitted
 once, here or by the middleware.
 
-Requests that arrive faster than they are answered wait in a queue, the oldest first. It has at most `max_waiting`
-requests, or as many as are answered soon (see `Backlog`), with bodies of at most LARGE_BODY bytes that are not parsed
-yet. A turn ends after SLICE seconds, so that new requests are accepted or refused soon.
+Requests that arrive faster than they are answered wait in a queue, the oldest first. It has as many as are answered
+soon (see `Backlog`), with bodies of at most LARGE_BODY bytes that are not parsed yet. A turn ends after SLICE seconds,
+so that new requests are accepted or refused soon.
 """
 
 from asyncio import AbstractEventLoop
@@ -104,14 +104,15 @@ class InferenceQueue:
             connection.loop.call_soon(self._take_turn, connection.loop)
 
     def _take_turn(self, loop: AbstractEventLoop) -> None:
-        begin, answered = monotonic(), 0
+        begin, answered, backlog = monotonic(), 0, self._serving.access.backlog
         try:
             self._admit()
             while self._queue and (not answered or monotonic() < begin + SLICE):
                 answered += min(GROUP, len(self._queue))
                 self._answer_group()
         finally:  # whatever happens to one connection
-            self._serving.access.backlog.end_slice(answered, monotonic() - begin, len(self._queue))
+            if answered:
+                backlog.count_answered(answered, monotonic() - begin)
             self._has_turn = bool(self._queue)
             if self._has_turn:
                 loop.call_soon(self._take_turn, loop)
@@ -128,13 +129,16 @@ class InferenceQueue:
             scope = cast(Scope, connection.scope)
             try:
                 scope[ADMISSION] = self._serving.access.admission(scope, self._target(connection).path)
-                self._queue.append((time, connection))
             except Exception as error:
                 self._refuse(connection, error)
+            else:
+                self._queue.append((time, connection))
+                self._serving.access.backlog.queued += 1
 
     def _answer_group(self) -> None:
         for _ in range(min(GROUP, len(self._queue))):
             time, connection = self._queue.popleft()
+            self._serving.access.backlog.queued -= 1
             target, headers = self._target(connection), cast(Scope, connection.scope)["headers"]
             route = self._action if target.is_action else self._infer
             try:

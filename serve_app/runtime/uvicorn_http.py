@@ -1,5 +1,4 @@
-"""uvicorn's HTTP protocol with batched accepts, notification of shutdown, the length of the accept queue, and limits
-for idle connections.
+"""uvicorn's HTTP protocol with batched accepts, notification of shutdown, and limits for idle connections.
 
 uvloop accepts one connection per turn of the event loop, and a turn handles the requests of all open connections. If
 many clients connect at once with slow requests, the last one would wait for a long time. Therefore each new
@@ -39,9 +38,6 @@ OF_ONE_ADDRESS, CROWDED = 1 / 8, 1 / 4
 from which on each is closed after its response."""
 FIRST_REQUEST = 10.0
 """Seconds in which the head of the first request must arrive."""
-TCP_INFO_BYTES = 28
-UNACKED = slice(24, 28)
-"""Offset of `tcpi_unacked` in struct tcp_info (linux/tcp.h): for a listening socket, the length of its accept queue."""
 
 
 class AcceptQueue:
@@ -55,16 +51,6 @@ class AcceptQueue:
     def __del__(self) -> None:
         if self._listener is not None:
             self._listener.detach()
-
-    def length(self) -> int:
-        """Number of waiting connections. Takes about a microsecond."""
-        if self._listener is None:
-            return 0
-        try:
-            info = self._listener.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_INFO_BYTES)
-        except OSError:  # no longer listening
-            return 0
-        return int.from_bytes(info[UNACKED], "little")
 
     def take(self) -> socket.socket | None:
         """Accept the next connection without blocking; None if there is none."""
@@ -80,7 +66,7 @@ class AcceptQueue:
 
 def _listener(port: int) -> socket.socket | None:
     """The socket itself. A duplicate would keep listening after its owner has closed it."""
-    with suppress(OSError, AttributeError):  # no /proc, no TCP_INFO: not Linux
+    with suppress(OSError):  # no /proc: not Linux
         for entry in Path("/proc/self/fd").iterdir():
             with suppress(OSError):
                 if stat.S_ISSOCK(entry.stat().st_mode) and _listens(int(entry.name), port):

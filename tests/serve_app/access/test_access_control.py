@@ -193,30 +193,21 @@ def test_a_rate_limit_is_enforced(registry: Registry, monkeypatch: pytest.Monkey
             assert client.post(ACTION, json=BODY, headers=bearer(tokens["fast"])).status_code == 200
 
 
-@pytest.mark.parametrize(("is_late", "admissions"), [(False, 1), (True, 2)])
-def test_a_body_that_arrives_late_is_admitted_like_a_request(
-    registry: Registry, monkeypatch: pytest.MonkeyPatch, is_late: bool, admissions: int
-) -> None:
+def test_a_body_is_admitted_when_it_has_arrived(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise clients could open many requests, and send all bodies at the same time."""
     server, send = Replica(Registry.open(registry.storage), QUICK, "replica-1"), AsyncMock()
-    admit = Mock(side_effect=Backlog.admit)
-    monkeypatch.setattr(Backlog, "admit", lambda backlog: admit(backlog))
+    admissions: list[str] = []
+    monkeypatch.setattr(Backlog, "admit", lambda _: admissions.append("body"))
 
     async def receive() -> Message:
-        for _ in range(3 * is_late):
-            await asyncio.sleep(0)
+        assert not admissions
         return {"type": "http.request", "body": json.dumps(BODY).encode()}
 
     scope = {"type": "http", "method": "POST", "headers": [], "query_string": b"", "path_params": {"model": "board"}}
-
-    async def call() -> None:
-        server.access.backlog.admit()  # as the middleware does
-        await server.action(scope, receive, send)
-
     with local_client(server) as client:
         assert client.portal is not None
-        client.portal.call(call)
-    assert (send.await_args_list[0].args[0]["status"], admit.call_count) == (200, admissions)
+        client.portal.call(server.action, scope, receive, send)
+    assert (send.await_args_list[0].args[0]["status"], admissions) == (200, ["body"])
 
 
 def test_a_rejected_stream_has_an_error_response(registry: Registry) -> None:

@@ -5,7 +5,7 @@ import gzip
 import json
 import resource
 import zlib
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
@@ -171,118 +171,55 @@ def test_connections_leave_file_descriptors_for_the_rest_of_the_process() -> Non
 
 
 pytestmark = pytest.mark.anyio
-LIMIT, SHARE, PATIENCE = 3, 0.025, 0.1
+MAX_WAIT = 0.25
 
 
 class Loop:
-    """A backlog with a controlled number and duration of requests in each turn of the event loop."""
+    """A backlog with a controlled duration of the requests in each turn of the event loop."""
 
-    def __init__(self, limit: int = LIMIT) -> None:
+    def __init__(self) -> None:
         self.now = 1000.0
-        self.backlog = Backlog(limit, SHARE, PATIENCE, lambda: self.now)
+        self.backlog = Backlog(MAX_WAIT, lambda: self.now)
 
-    async def turn(self, requests: int, seconds: float, each: float = 0.0) -> int:
-        """The number of requests admitted in a turn. each: additional seconds of each admitted request."""
+    async def turn(self, requests: int, seconds: float) -> int:
+        """The number of requests admitted in a turn, each of which takes `seconds`."""
         admitted = 0
         for _ in range(requests):
-            try:
+            with suppress(Overloaded):
                 self.backlog.admit()
-            except Overloaded:
-                continue
-            admitted += 1
-            self.now += each
-        self.now += seconds
+                admitted += 1
+                self.now += seconds
         await asyncio.sleep(0)
         return admitted
 
-    async def idle(self) -> None:
-        """Turns without requests."""
-        for _ in range(3):
-            await asyncio.sleep(0)
 
-
-async def test_a_short_queue_is_never_shed() -> None:
+async def test_a_turn_starts_what_it_reaches_in_time() -> None:
     loop = Loop()
-    assert [await loop.turn(LIMIT, 0.02) for _ in range(20)] == [LIMIT] * 20
+    assert [await loop.turn(400, 0.0005) for _ in range(20)] == [400] * 20
+    assert [await loop.turn(64, 0.0104) for _ in range(20)] == [25] * 20
+    assert [await loop.turn(10, 1.0) for _ in range(5)] == [1] * 5
+    assert [await loop.turn(1, 5.0) for _ in range(5)] == [1] * 5, "a single request is not a queue"
 
 
-async def test_single_requests_are_not_a_queue_however_long_they_take() -> None:
+@pytest.mark.parametrize(("seconds", "requests"), [(0.01, 26), (0.001, 251), (0.0001, 2501)])
+async def test_a_queue_has_as_many_requests_as_are_answered_in_time(seconds: float, requests: int) -> None:
     loop = Loop()
-    assert [await loop.turn(1, 1.0) for _ in range(20)] == [1] * 20
-    assert await loop.turn(2, 0.0, each=2 * SHARE) == 2, "no queue has built up"
-
-
-async def test_the_number_of_requests_in_a_turn_depends_on_their_duration() -> None:
-    heavy, light = Loop(limit=1000), Loop(limit=1000)
-    assert [await heavy.turn(64, 0.0, each=0.01) for _ in range(2)] == [64] * 2, "a burst"
-    assert [await heavy.turn(64, 0.0, each=0.01) for _ in range(20)] == [3] * 20, "requests started within the share"
-    assert [await light.turn(400, 0.0, each=0.00005) for _ in range(20)] == [400] * 20
-
-
-async def test_a_turn_always_admits_one_request() -> None:
-    loop = Loop()
-    for _ in range(3):
-        await loop.turn(10, 0.0, each=1.0)
-    assert [await loop.turn(10, 0.0, each=1.0) for _ in range(5)] == [1] * 5
-
-
-async def test_a_persistent_queue_is_shed_until_it_is_short() -> None:
-    loop = Loop()
-    assert [await loop.turn(10, 0.03) for _ in range(4)] == [10] * 4
-    await loop.turn(10, 0.03)
-    assert [await loop.turn(10, 0.03) for _ in range(20)] == [LIMIT] * 20
-    assert await loop.turn(LIMIT, 0.02) == LIMIT
-    assert await loop.turn(10, 0.03) == 10, "the time starts again"
-
-
-async def test_requests_of_earlier_turns_take_places_until_they_are_answered() -> None:
-    loop = Loop(limit=10)
-    loop.backlog.queued = 8
-    assert [await loop.turn(2, 0.02) for _ in range(20)] == [2] * 20
-    for _ in range(10):
-        await loop.turn(5, 0.02)
-    assert [await loop.turn(5, 0.02) for _ in range(20)] == [2] * 20
-    await loop.idle()
-    assert await loop.turn(5, 0.02) == 2, "it is not empty yet"
+    loop.backlog.queued = 10_000
+    assert await loop.turn(1, 0.0) == 1, "the duration of a request is not known yet"
     loop.backlog.queued = 0
-    await loop.idle()
-    assert await loop.turn(20, 0.02) == 20, "the time starts again"
+    for _ in range(200):
+        loop.backlog.count_answered(32, 32 * seconds)
+    while await loop.turn(1, 0.0):
+        loop.backlog.queued += 1
+    assert loop.backlog.queued == pytest.approx(requests, abs=1)
 
 
-async def test_a_queue_has_as_many_requests_as_are_answered_soon() -> None:
-    heavy, light = Loop(limit=1000), Loop(limit=1000)
-    for loop, seconds in ((heavy, 0.005), (light, 0.0001)):
-        for _ in range(100):
-            loop.backlog.end_slice(32, 32 * seconds, queued=40)
-        for _ in range(6):
-            await loop.turn(200, 0.03)
-    assert [await heavy.turn(200, 0.03) for _ in range(20)] == [10] * 20, "50 requests in 0.25 s"
-    assert [await light.turn(200, 0.03) for _ in range(20)] == [200] * 20
-    heavy.backlog.end_slice(32, 0.16, queued=30)
-    assert await heavy.turn(10, 0.01) == 10
-    assert await heavy.turn(200, 0.03) == 20, "the queue has not become short"
-    heavy.backlog.end_slice(32, 0.16, queued=20)
-    assert await heavy.turn(1, 0.01) == 1
-    assert await heavy.turn(200, 0.03) == 200, "the time starts again"
-
-
-async def test_occasional_bursts_are_not_shed() -> None:
+async def test_requests_wait_for_the_queue_and_for_those_of_their_turn() -> None:
     loop = Loop()
-    for _ in range(20):
-        assert await loop.turn(100, 0.05) == 100
-        await loop.idle()
-
-
-async def test_one_long_turn_is_not_a_persistent_queue() -> None:
-    loop = Loop()
-    assert await loop.turn(10, 5.0) == 10
-    assert await loop.turn(10, 0.01) == 10
-
-
-async def test_turns_longer_than_the_tolerance_are_shed() -> None:
-    loop = Loop()
-    assert [await loop.turn(10, 3 * PATIENCE) for _ in range(2)] == [10] * 2
-    assert [await loop.turn(10, 3 * PATIENCE) for _ in range(20)] == [LIMIT] * 20
+    for _ in range(100):
+        loop.backlog.count_answered(1, 0.001)
+    loop.backlog.queued = 200
+    assert await loop.turn(100, 0.0101) == 5
 
 
 DISCONNECT: Message = {"type": "http.disconnect"}

@@ -18,7 +18,7 @@ QUICK = ServeSettings(
     max_batch=8,
     timeout=120.0,
     run_timeout=60.0,
-    burst_tolerance=60.0,
+    max_wait=60.0,
 )
 """Settings of a replica for tests: short intervals, low limits, and patience: on a busy machine a healthy request may
 take longer than users wait."""

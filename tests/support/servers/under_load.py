@@ -20,7 +20,7 @@ from serve_app.runtime.launch import DEPLOY_YAML
 ACTION = "/v1/policies/board/action"
 
 
-NO_SHEDDING = {"burst_tolerance": 60.0}
+NO_SHEDDING = {"max_wait": 60.0}
 """Settings of a server that sheds no load: on a busy machine, a shed request would look like a failure."""
 
 
