@@ -3,8 +3,8 @@
     ?version=N      pinned to that version, or to the one that an alias (default: champion) names at the handshake
     ?follow=ALIAS   each message is answered by the version that the alias names at that time
 
-With serve_app.runtime.uvicorn_websocket, messages are answered within the call that received them; other ASGI servers
-pass them through the ASGI queue. A stream is closed when its key becomes invalid, even if it receives no messages.
+The connection answers messages within the call that received them (serve_app.runtime.uvicorn_websocket). A stream is
+closed when its key becomes invalid, even if it receives no messages.
 
 A change of the number of replicas reloads HAProxy, which cuts the streams that it forwards, all at once, two minutes
 later. Streams are closed before, one after the other, so that their clients do not reconnect at the same moment.
@@ -14,12 +14,11 @@ import asyncio
 import random
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from starlette.types import Receive, Scope, Send
 
-from league.errors import InvalidInput, Unauthenticated, one_line
+from league.errors import InvalidInput, Unauthenticated
 from league.refs import CHAMPION, check_alias
 from serve_app.access.access_control import KEY, POLICY_VIOLATION, SUBPROTOCOL
 from serve_app.access.api_keys import ApiKey
@@ -32,12 +31,7 @@ from serve_app.live_versions.resolver import policy_ref, version_of
 from serve_app.routes.query_string import query_params
 from serve_app.runtime.background import in_background
 from serve_app.runtime.ray_serve import logger
-from serve_app.runtime.uvicorn_websocket import (
-    STREAM_PROTOCOL,
-    TOO_BIG,
-    CloseStream,
-    StreamWebSocketProtocol,
-)
+from serve_app.runtime.uvicorn_websocket import STREAM_PROTOCOL, StreamWebSocketProtocol
 
 KEY_CHECK_INTERVAL = 1.0
 """Seconds between checks of the keys of open streams."""
@@ -58,28 +52,6 @@ WHILE_DRAINING = ClosingTimes(5.0, 28.0)
 RECONNECT = "the number of replicas has changed: reconnect"
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class OpenStream:
-    """A stream whose handshake was accepted."""
-
-    key: ApiKey | None
-    send: Send
-    protocol: StreamWebSocketProtocol | None
-    """The connection, if messages are answered within the call that received them."""
-
-    def restart(self) -> None:
-        """Close the stream so that its client reconnects, with the state that it needs to continue."""
-        if self.protocol is not None:
-            self.protocol.restart(RECONNECT)
-
-    async def close(self, end: CloseStream) -> None:
-        """Send a close frame."""
-        if self.protocol is not None:
-            self.protocol.end(end.code, end.reason)
-        else:
-            await self.send({"type": "websocket.close", "code": end.code, "reason": end.reason})
-
-
 class StreamRoute:
     """The endpoint as a plain ASGI application. is_draining: whether this replica is being stopped."""
 
@@ -96,8 +68,9 @@ class StreamRoute:
                 limit,
             )
         self.connections = ConnectionLimit("streams", limit, settings.max_streams_per_key)
-        self._accepted: set[OpenStream] = set()
-        self._closings: dict[OpenStream, asyncio.TimerHandle] = {}
+        self._accepted: dict[StreamWebSocketProtocol, ApiKey | None] = {}
+        """The connections of open streams, and their keys."""
+        self._closings: dict[StreamWebSocketProtocol, asyncio.TimerHandle] = {}
         self._replicas: int | None = None
         """Number of replicas at the last heartbeat."""
 
@@ -141,13 +114,14 @@ class StreamRoute:
             stream, headers = await self._create_session(scope)
             subprotocol = SUBPROTOCOL if SUBPROTOCOL in scope["subprotocols"] else None
             await send({"type": "websocket.accept", "subprotocol": subprotocol, "headers": headers})
-            opened = OpenStream(scope.get(KEY), send, scope.get("extensions", {}).get(STREAM_PROTOCOL))
-            self._accepted.add(opened)
+            connection: StreamWebSocketProtocol = scope["extensions"][STREAM_PROTOCOL]
+            self._accepted[connection] = scope.get(KEY)
             try:
-                await self._exchange_messages(stream, opened, receive)
+                connection.set_handler(stream)
+                await receive()  # the end
             finally:
-                self._accepted.remove(opened)
-                if (closing := self._closings.pop(opened, None)) is not None:
+                del self._accepted[connection]
+                if (closing := self._closings.pop(connection, None)) is not None:
                     closing.cancel()
 
     def replicas_counted(self, number: int) -> None:
@@ -171,31 +145,23 @@ class StreamRoute:
             await asyncio.sleep(KEY_CHECK_INTERVAL)
             if self._is_draining():
                 self._reconnect(WHILE_DRAINING)
-            for stream in tuple(self._accepted):
+            for connection, key in tuple(self._accepted.items()):
                 try:
-                    self._serving.access.check_key(stream.key)
+                    self._serving.access.check_key(key)
                 except Unauthenticated as error:
-                    await self._close(stream, CloseStream(POLICY_VIOLATION, str(error)))
+                    connection.end(POLICY_VIOLATION, str(error))
 
     def _reconnect(self, times: ClosingTimes) -> None:
         """Close the open streams at random times, or earlier if that was decided before."""
         loop = asyncio.get_running_loop()
         latest = loop.time() + times.last
-        for stream in self._accepted:
-            closing = self._closings.get(stream)
+        for connection in self._accepted:
+            closing = self._closings.get(connection)
             if closing is not None and closing.when() <= latest:
                 continue
             if closing is not None:
                 closing.cancel()
-            self._closings[stream] = loop.call_later(random.uniform(*times), stream.restart)
-
-    async def _close(self, stream: OpenStream, end: CloseStream) -> None:
-        """Close a stream. A stream that cannot be closed must not prevent that others are."""
-        try:
-            async with asyncio.timeout(KEY_CHECK_INTERVAL):
-                await stream.close(end)
-        except Exception as error:
-            logger.warning("a stream cannot be closed: %s", one_line(error, with_type=True))
+            self._closings[connection] = loop.call_later(random.uniform(*times), connection.restart, RECONNECT)
 
     async def _create_session(self, scope: Scope) -> tuple[StreamSession, list[tuple[bytes, bytes]]]:
         model, query = scope["path_params"]["model"], query_params(scope)
@@ -214,19 +180,3 @@ class StreamRoute:
         headers = {b"x-league-version": str(policy.number), b"x-league-sha256": policy.sha256, REPLICA: self._replica}
         stream = StreamSession(self._serving, model, policy, follows, scope["headers"], scope.get(KEY))
         return stream, [(name, value.encode()) for name, value in headers.items()]
-
-    async def _exchange_messages(self, stream: StreamSession, opened: OpenStream, receive: Receive) -> None:
-        if opened.protocol is not None:
-            opened.protocol.set_handler(stream)
-        while (message := await receive())["type"] == "websocket.receive":
-            text = message.get("text")
-            data = message["bytes"] if text is None else text.encode()
-            try:
-                if len(data) > self._serving.settings.max_body:
-                    raise CloseStream(TOO_BIG, f"a message is larger than {self._serving.settings.max_body} bytes")
-                response = await stream.answer(data, text is not None)
-            except CloseStream as end:
-                await opened.close(end)
-                return
-            key, value = ("text", response.data.decode()) if response.is_text else ("bytes", response.data)
-            await opened.send({"type": "websocket.send", key: value})

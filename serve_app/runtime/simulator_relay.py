@@ -59,11 +59,10 @@ async def relay(
 ) -> None:
     """Pass messages on until one side closes, or `until` says how to close. admit_frame: see MessageHandler."""
     messages = _Messages(admit_frame)
-    ends = [asyncio.ensure_future(work) for work in (_upwards(receive, messages), _downwards(send, gateway), until)]
+    ends = [asyncio.ensure_future(work) for work in (_closed(receive), _downwards(send, gateway), until)]
     tasks = [*ends, asyncio.create_task(messages.pass_on(gateway))]
-    protocol: StreamWebSocketProtocol | None = scope.get("extensions", {}).get(STREAM_PROTOCOL)
-    if protocol is not None:
-        protocol.set_handler(messages)
+    connection: StreamWebSocketProtocol = scope["extensions"][STREAM_PROTOCOL]
+    connection.set_handler(messages)
     try:
         ended, _ = await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
         close = next((task.result() for task in ends if task in ended), None)
@@ -76,11 +75,9 @@ async def relay(
             await send({"type": "websocket.close", "code": close.code, "reason": close.reason})
 
 
-async def _upwards(receive: Receive, messages: "_Messages") -> None:
-    """Take what an ASGI server other than uvicorn passes on, until the simulator has closed."""
-    while (message := await receive())["type"] == "websocket.receive":
-        text = message.get("text")
-        await messages.answer(message["bytes"] if text is None else text.encode(), text is not None)
+async def _closed(receive: Receive) -> None:
+    """Wait until the simulator has closed."""
+    await receive()
 
 
 async def _downwards(send: Send, gateway: ClientConnection) -> CloseFrame:

@@ -50,6 +50,8 @@ CLOSE_TIMEOUT = 2.0
 SERVICE_RESTART = 1012
 TRY_AGAIN_LATER = 1013
 TOO_BIG = 1009
+MAX_REASON = 120
+"""Characters of the reason in a close frame, which are ASCII."""
 MAX_FRAGMENTS = 1024
 """Frames of a fragmented message: empty ones would take memory without being counted as bytes."""
 SMALL = 4 * 1024
@@ -71,7 +73,7 @@ class CloseStream(Exception):
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(reason)
         self.code = code
-        self.reason = reason[:120]
+        self.reason = reason
 
 
 class Deferred(Protocol):
@@ -250,6 +252,7 @@ class StreamWebSocketProtocol(WebSocketsSansIOProtocol):
 
     def end(self, code: int, reason: str) -> None:
         """Send a close frame, and wait for the client's."""
+        reason = reason[:MAX_REASON]
         self._flush()
         if self.close_sent or self.transport.is_closing():
             return

@@ -357,14 +357,6 @@ def test_each_message_counts_for_the_rate_limit_of_a_key(registry: Registry, mon
         assert (error["code"], error["status"], error["retry_after"]) == ("rate_limited", 429, 2)
 
 
-def test_a_message_that_is_too_large_ends_the_stream(read_only_client: TestClient) -> None:
-    with open_stream(read_only_client) as stream:
-        stream.send_text(" " * (64 * 1024 + 1))
-        with pytest.raises(WebSocketDisconnect) as caught:
-            stream.receive_text()
-        assert caught.value.code == 1009
-
-
 def test_neither_a_full_queue_nor_an_internal_error_ends_a_stream(
     registry: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:

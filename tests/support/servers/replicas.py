@@ -8,6 +8,7 @@ from league.service_requests import GameRequest, GameResponse
 from league.settings import Storage
 from serve_app.app import Replica
 from serve_app.settings import ServeSettings
+from tests.support.servers.direct_streams import DirectStreams
 
 QUICK = ServeSettings(
     poll=0.03,
@@ -31,7 +32,7 @@ LOCALHOST = "http://localhost"
 def local_client(server: Replica) -> TestClient:
     """A client of a replica in this process; enter it to start the replica."""
     # TestClient ignores the base URL for WebSockets, hence the header.
-    return TestClient(server.application(), base_url=LOCALHOST, headers={"host": "localhost"})
+    return TestClient(DirectStreams(server.application()), base_url=LOCALHOST, headers={"host": "localhost"})
 
 
 def replica(storage: Storage, settings: ServeSettings = QUICK) -> TestClient:
