@@ -93,10 +93,11 @@ class Shadow:
 
     def mirror_for(self, policy: LoadedPolicy) -> MirrorFunction | None:
         """The function that mirrors a request that `policy` answers; None if it is not mirrored."""
-        target = self._traffic.shadows.get(policy.league)
-        if target is None or (target.share < 1 and random() >= target.share):
+        portion = self._traffic.shadows.get(policy.league)
+        if portion is None or (portion.share < 1 and random() >= portion.share):
             return None
-        shadow, champion = self._slots.get(policy.league, target.slot), self._slots.champion(policy.league)
+        shadow = self._traffic.serving(self._traffic.shadows, policy.league)
+        champion = self._slots.champion(policy.league)
         if shadow is None or champion is None or shadow is champion:
             return None
         if all(version.policies.get(policy.name) is not policy for version in (champion, *champion.members)):
@@ -149,8 +150,7 @@ class Shadow:
     def _compare_all(self) -> None:
         seconds = 0.0
         while (request := self._queue.get()) is not None:
-            target = self._traffic.shadows.get(request.shadow.league)
-            if target is not None and self._slots.get(request.shadow.league, target.slot) is request.shadow:
+            if self._traffic.serving(self._traffic.shadows, request.shadow.league) is request.shadow:
                 seconds += _compare(request)
             else:  # Its runs may be slow, and those of another shadow wait.
                 request.counts.dropped += 1

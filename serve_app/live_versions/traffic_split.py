@@ -4,11 +4,9 @@ The registry watcher reads the settings. The version of a canary or shadow has a
 named by number has a slot under that number, which is not a valid alias.
 """
 
-import hashlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from random import random
-from typing import NamedTuple
 
 from league.refs import CHAMPION
 from league.registry.storage.manifest import episode_position
@@ -19,14 +17,9 @@ from serve_app.live_versions.policies import LoadedVersion
 
 KEY = b"x-league-key"
 """Header that names what must stay with one version, such as a player or an episode."""
+CANARY = b""
+"""The purpose of positions that decide about a canary."""
 Headers = Iterable[tuple[bytes, bytes]]
-
-
-class SplitTarget(NamedTuple):
-    """A slot and its share of requests."""
-
-    slot: str
-    share: float
 
 
 class TrafficSplit:
@@ -35,9 +28,9 @@ class TrafficSplit:
     def __init__(self, slots: AliasSlots) -> None:
         self._slots = slots
         self._settings: dict[str, Setting] = {}
-        self.canaries: dict[str, SplitTarget] = {}
+        self.canaries: dict[str, Portion] = {}
         """league → its canary"""
-        self.shadows: dict[str, SplitTarget] = {}
+        self.shadows: dict[str, Portion] = {}
         """league → its shadow"""
         self.canary_requests: Counter[tuple[str, int]] = Counter()
         """(league, version) → requests answered as canary"""
@@ -45,8 +38,8 @@ class TrafficSplit:
     def update(self, settings: Mapping[str, Setting]) -> None:
         """Apply these settings from now on."""
         self._settings = dict(settings)
-        self.canaries = _targets({league: setting.canary for league, setting in settings.items()})
-        self.shadows = _targets({league: setting.shadow for league, setting in settings.items()})
+        self.canaries = _active({league: setting.canary for league, setting in settings.items()})
+        self.shadows = _active({league: setting.shadow for league, setting in settings.items()})
 
     def applied_setting(self, league: str) -> int | None:
         """The id of the league's setting, once all versions that it names are loaded."""
@@ -62,19 +55,20 @@ class TrafficSplit:
     def route(self, champion: LoadedVersion, headers: Headers) -> LoadedVersion:
         """The version that answers a request for a champion: the champion, or the canary if the caller's key is in its
         share.
+
+        A key keeps its side while the share is unchanged, and a larger share only adds keys.
         """
-        league = champion.league
-        target = self.canaries.get(league)
-        if target is None:
-            return champion
-        key = key_of(headers)
-        if key is None or key_position(league, key) >= target.share:
-            return champion
-        canary = self._slots.get(league, target.slot)
-        if canary is None:
+        league, canary = champion.league, self.serving(self.canaries, champion.league)
+        key = None if canary is None else key_of(headers)
+        if canary is None or key is None or episode_position(league, key, CANARY) >= self.canaries[league].share:
             return champion
         self.canary_requests[league, acting(canary, headers).number] += 1
         return canary
+
+    def serving(self, portions: Mapping[str, Portion], league: str) -> LoadedVersion | None:
+        """The loaded version of a portion of a league, if it has one: of `canaries` or of `shadows`."""
+        portion = portions.get(league)
+        return None if portion is None else self._slots.get(league, str(portion.version))
 
 
 def key_of(headers: Headers) -> bytes | None:
@@ -106,19 +100,9 @@ def pinned_slots(settings: Mapping[str, Setting]) -> dict[Alias, int]:
     return {slot: number for setting_slots in needed for slot, number in setting_slots.items() if number is not None}
 
 
-def key_position(league: str, key: bytes) -> float:
-    """Position of a key among all keys of a league, in [0, 1); keys below the canary's share go to the canary.
-
-    It depends on league and key only, so a key keeps its side while the share is unchanged, and a larger share only
-    adds keys.
-    """
-    digest = hashlib.blake2b(league.encode() + b"\0" + key, digest_size=8).digest()
-    return int.from_bytes(digest[:6], "big") / 2**48  # exact as a double, so the result is less than 1
-
-
-def _targets(portions: Mapping[str, Portion | None]) -> dict[str, SplitTarget]:
+def _active(portions: Mapping[str, Portion | None]) -> dict[str, Portion]:
     return {
-        league: SplitTarget(str(portion.version), portion.share)
+        league: portion
         for league, portion in portions.items()
         if portion is not None and portion.share and portion.version != CHAMPION
     }

@@ -93,12 +93,12 @@ class SearchSettings(FrozenModel):
         return f"@{self.version}, {self.simulations} simulations, {self.rule}, {self.ms:.3g} ms"
 
 
-def episode_position(league: str, episode: bytes) -> float:
+def episode_position(league: str, episode: bytes, purpose: bytes = b"mixture") -> float:
     """Return the position of an episode among all episodes of a league, in [0, 1), uniformly distributed.
 
-    It depends on both names only. It is independent of the position that decides about a canary.
+    It depends on the arguments only. Positions for different purposes are independent.
     """
-    digest = hashlib.blake2b(league.encode() + b"\0" + episode, digest_size=8, person=b"mixture").digest()
+    digest = hashlib.blake2b(league.encode() + b"\0" + episode, digest_size=8, person=purpose).digest()
     return int.from_bytes(digest[:6], "big") / 2**48  # exact as a double, so the result is less than 1
 
 
