@@ -6,7 +6,6 @@ no cache; its fields are 0.
 """
 
 import time
-from collections import OrderedDict
 from collections.abc import Iterable
 from copy import deepcopy
 from typing import Any
@@ -84,23 +83,17 @@ class Statistics:
     """Statistics of a replica since it started."""
 
     def __init__(self) -> None:
-        self._entries: OrderedDict[tuple[str, int], ModelStatistics] = OrderedDict()
+        self._entries: dict[tuple[str, int], ModelStatistics] = {}
+        """The most recently used last."""
 
     def entry(self, name: str, version: int) -> ModelStatistics:
         """The entry of a version, created if necessary."""
-        key = (name, version)
-        if (entry := self._entries.get(key)) is None:
-            entry = self._entries[key] = ModelStatistics(name, version)
-            if len(self._entries) > MAX_ENTRIES:
-                self._entries.popitem(last=False)
-        else:
-            self._entries.move_to_end(key)
+        entry = self._entries.pop((name, version), None) or ModelStatistics(name, version)
+        self._entries[name, version] = entry
+        if len(self._entries) > MAX_ENTRIES:
+            del self._entries[next(iter(self._entries))]
         return entry
 
-    def documents(self, name: str | None = None, version: int | None = None) -> list[dict[str, Any]]:
-        """The entries of a model and a version, by default all."""
-        return [
-            deepcopy(entry.document)
-            for (of, number), entry in sorted(self._entries.items())
-            if name in (None, of) and version in (None, number)
-        ]
+    def documents(self) -> list[Document]:
+        """All entries."""
+        return [deepcopy(entry.document) for _, entry in sorted(self._entries.items())]

@@ -275,11 +275,9 @@ def test_the_least_recently_used_entry_is_evicted() -> None:
         statistics.entry("board", version)
     statistics.entry("board", 1).fail(1)
     statistics.entry("board", MAX_ENTRIES + 1)
-    kept = statistics.documents("board")
+    kept = statistics.documents()
     assert len(kept) == MAX_ENTRIES
     assert [document["version"] for document in kept[:2]] == ["1", "3"]
-    assert statistics.documents("duo") == []
-    assert [document["version"] for document in statistics.documents("board", 7)] == ["7"]
 
 
 def test_statistics_of_replicas_are_summed_by_model_and_version() -> None:
@@ -290,9 +288,7 @@ def test_statistics_of_replicas_are_summed_by_model_and_version() -> None:
     first, second = sum_documents([document for statistics in replicas for document in statistics.documents()])
     assert (first["version"], first["inference_count"], first["execution_count"]) == ("1", 3, 2)
     assert first["inference_stats"]["success"] == {"count": 2, "ns": 12}
-    assert first["last_inference"] == max(
-        statistics.documents("board", 1)[0]["last_inference"] for statistics in replicas
-    )
+    assert first["last_inference"] == max(statistics.documents()[0]["last_inference"] for statistics in replicas)
     assert (second["version"], second["inference_stats"]["fail"]["count"]) == ("2", 1)
 
 
