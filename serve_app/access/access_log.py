@@ -3,31 +3,30 @@
     {"time": "2026-03-03T14:00:00.123Z", "method": "POST", "route": "/v1/policies/connect_four/action",
      "policy": "connect_four", "version": 4, "status": 200, "us": 83, "key": "game-server"}
 
-`us` is the time spent in the replica in microseconds. `key` is the name of the API key, never its text. Entries are
-buffered and written by a thread. If the disk is full, log lines are lost; requests are unaffected.
+`us` is the time spent in the replica in microseconds. `key` is the name of the API key, never its text. A thread writes
+the lines. If the disk is full, they are lost; requests are unaffected.
 """
 
 import asyncio
-import logging
-from collections.abc import AsyncIterator, Iterable
-from concurrent.futures import ThreadPoolExecutor
+import sys
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime
-from logging.handlers import RotatingFileHandler
+from io import TextIOWrapper
+from logging import LogRecord, makeLogRecord
+from logging.handlers import QueueListener, RotatingFileHandler
 from pathlib import Path
+from queue import SimpleQueue
 from time import perf_counter_ns
 from typing import Any
 
 import orjson
 from starlette.types import Message, Scope, Send
 
-from serve_app.runtime.background import in_background
 from serve_app.runtime.ray_serve import logger
 
-WRITE_INTERVAL = 0.5
-"""Seconds between two writes."""
-MAX_BUFFERED = 20_000
-"""Maximum number of buffered lines; further lines are dropped."""
+MAX_WAITING = 20_000
+"""Maximum number of lines that wait to be written; further ones are dropped."""
 MAX_FILE_BYTES, BACKUP_COUNT = 64 * 2**20, 4
 """Size at which a file is rotated, and the number of rotated files that are kept."""
 LOG_ENTRY = "league.access"
@@ -38,11 +37,8 @@ class AccessLog:
     """Writes `access-<replica>.jsonl` in a directory. All methods run on the event loop."""
 
     def __init__(self, directory: Path, replica: str) -> None:
-        self.path = directory / f"access-{replica}.jsonl"
-        self._lines: list[dict[str, Any]] = []
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="access-log")
-        self._file: RotatingFileHandler | None = None
-        self._has_failed = False
+        self._records = SimpleQueue[LogRecord]()
+        self._file = _File(directory / f"access-{replica}.jsonl")
 
     def begin(self, scope: Scope, path: str, send: Send) -> Send:
         """Start the entry of a request; returns a `send` that completes it."""
@@ -58,52 +54,42 @@ class AccessLog:
             is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
             if is_end or message["type"] == "websocket.close":
                 line["time"], line["us"] = datetime.now(UTC), (perf_counter_ns() - start) // 1000
-                if len(self._lines) < MAX_BUFFERED:
-                    self._lines.append(line)
+                if self._records.qsize() < MAX_WAITING:
+                    self._records.put(makeLogRecord({"msg": line}))
 
         return noting
 
     @asynccontextmanager
     async def writing(self) -> AsyncIterator[None]:
-        """Write buffered lines while the context is active, and the remaining ones on exit."""
+        """Write lines while the context is active, and the remaining ones on exit."""
+        listener = QueueListener(self._records, self._file)
+        listener.start()
         try:
-            async with in_background(self._write_on()):
-                yield
+            yield
         finally:
-            await self._write()
-            self._thread.shutdown()
-            if self._file is not None:
-                self._file.close()
-
-    async def _write_on(self) -> None:
-        while True:
-            await asyncio.sleep(WRITE_INTERVAL)
-            await self._write()
-
-    async def _write(self) -> None:
-        lines, self._lines = self._lines, []
-        if lines:
-            await asyncio.get_running_loop().run_in_executor(self._thread, self._put, lines)
-
-    def _put(self, lines: Iterable[dict[str, Any]]) -> None:
-        text = "\n".join(orjson.dumps(line, option=orjson.OPT_UTC_Z).decode() for line in lines)
-        try:
-            if self._file is None:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                self._file = RotatingFileHandler(self.path, maxBytes=MAX_FILE_BYTES, backupCount=BACKUP_COUNT)
-            record = logging.LogRecord("access", logging.INFO, "", 0, text, None, None)
-            if self._file.shouldRollover(record):
-                self._file.doRollover()
-            assert self._file.stream is not None, "it is open"
-            self._file.stream.write(text + "\n")
-            self._file.flush()
-            self._has_failed = False
-        except OSError as error:
-            if not self._has_failed:
-                logger.error("cannot write the access log %s, lines are lost: %s", self.path, error)
-            self._has_failed = True
+            await asyncio.to_thread(listener.stop)
+            self._file.close()
 
 
-def log_version(scope: Scope, model: str, version: int) -> None:
-    """Record the model and version that answered a logged request."""
-    scope[LOG_ENTRY] |= {"policy": model, "version": version}
+class _File(RotatingFileHandler):
+    """A file that is opened, with its directory, when the first line is written."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, maxBytes=MAX_FILE_BYTES, backupCount=BACKUP_COUNT, delay=True)
+        self._has_failed = False
+
+    def _open(self) -> TextIOWrapper:
+        Path(self.baseFilename).parent.mkdir(parents=True, exist_ok=True)
+        return super()._open()
+
+    def format(self, record: LogRecord) -> str:
+        return orjson.dumps(record.msg, option=orjson.OPT_UTC_Z).decode()
+
+    def flush(self) -> None:  # after each line
+        super().flush()
+        self._has_failed = False
+
+    def handleError(self, _: LogRecord) -> None:  # noqa: N802
+        if not self._has_failed:
+            logger.error("cannot write the access log %s, lines are lost: %s", self.baseFilename, sys.exc_info()[1])
+        self._has_failed = True

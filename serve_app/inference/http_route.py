@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 from starlette.types import Receive, Scope, Send
 
 from serve_app.access.access_control import KEY
-from serve_app.access.access_log import LOG_ENTRY, log_version
+from serve_app.access.access_log import LOG_ENTRY
 from serve_app.access.request_body import BODY_READ, read_bytes
 from serve_app.inference.serving import Serving
 from serve_app.live_versions.traffic_split import Headers
@@ -71,7 +71,7 @@ class HttpRoute(ABC):
                 access.admit_body(scope.get(KEY), len(body))
                 reply = await self.answer(model, version, scope["headers"], body, start)
             if LOG_ENTRY in scope:
-                log_version(scope, model, reply.version)
+                scope[LOG_ENTRY] |= {"policy": model, "version": reply.version}
             headers = [*reply.headers, (b"content-length", b"%d" % len(reply.body)), self._replica]
             await send({"type": "http.response.start", "status": 200, "headers": headers})
             await send({"type": "http.response.body", "body": reply.body})
