@@ -5,7 +5,6 @@
 Ray checks HAProxy every second and replaces it a few seconds after the third failure. Until then a stand-in answers:
 HAProxy with the last configuration that had routes, unknown to Ray. The next HAProxy of Ray that has routes takes over
 the port. An HAProxy without routes does not listen for requests, because it would respond to all of them with 404.
-While the server starts, serve_app.runtime.starting_page responds in place of a stand-in, until a replica is known.
 
 Idle and silent connections must not take the place of others. An address has a share of the connections, which is
 larger after a replica has accepted an API key from it. While many connections are open, each of them is closed after

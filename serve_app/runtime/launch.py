@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -30,9 +30,8 @@ from league.ray_cluster import LocalRay, check_stacks, join, node_addresses, ray
 from league.registry.registry import Registry
 from league.settings import Storage
 from league.subprocesses import Subprocess, when_parent_ends
-from serve_app.runtime import haproxy, haproxy_script, ray_serve
+from serve_app.runtime import haproxy, ray_serve
 from serve_app.runtime.autoscaling import LoadPolicy
-from serve_app.runtime.starting_page import starting_page
 from serve_app.settings import ServeSettings, is_exposed
 
 OnReady = Callable[[str, Path, str | None], None]
@@ -256,7 +255,7 @@ def _serve_locally(document: dict[str, Any], dashboard: bool, on_ready: OnReady 
     http = document["http_options"]
     host, port = http["host"], http["port"]
     grpc = document.get("grpc_options", {})
-    with haproxy.private_directory() as directory, ExitStack() as until_stopped:
+    with haproxy.private_directory() as directory:
         for option, requested_port in [("--port", port), *([("--grpc-port", grpc["port"])] if grpc else [])]:
             if not haproxy.is_free(host, requested_port):
                 raise AlreadyRunning(
@@ -264,9 +263,6 @@ def _serve_locally(document: dict[str, Any], dashboard: bool, on_ready: OnReady 
                 )
         # HAProxy and Ray could choose different addresses of a name.
         _, http["host"] = haproxy.listening_address(host)
-        binary = haproxy_script.find_haproxy()
-        if binary is not None:  # otherwise `check_haproxy` raises
-            until_stopped.enter_context(starting_page(directory, binary, http["host"], port, grpc.get("port")))
         largest = {"RAY_SERVE_GRPC_MAX_MESSAGE_SIZE": str(_settings(document).max_body)}
         for name, value in (haproxy.environment(directory) | largest).items():
             os.environ.setdefault(name, value)

@@ -8,13 +8,10 @@ import ast
 import inspect
 import re
 import subprocess
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from time import monotonic, sleep
 from types import SimpleNamespace
 
-import httpx
 import pytest
 import uvicorn
 from ray._private.function_manager import FunctionActorManager
@@ -34,8 +31,6 @@ from websockets.server import ServerProtocol
 
 from serve_app.runtime import haproxy, haproxy_script, ray_serve, uvicorn_http, uvicorn_websocket
 from serve_app.runtime.ray_serve import AsgiReplica
-from serve_app.runtime.starting_page import starting_page
-from tests.support.waiting import until
 
 STATS, METRICS, HTTP, GRPC = 8404, 9101, 8000, 8001
 SERVICER = "serve_app.inference_protocol.grpc_handlers:add_service"
@@ -176,7 +171,7 @@ class TestHAProxyConfiguration:
             assert process.returncode == 0, f"HAProxy refuses {name} after haproxy_script.py: {process.stderr}"
             assert "local0" not in (directory / name).read_text(), "haproxy_script.py does not find the line of the log"
 
-    def test_the_starting_page_responds_until_a_replica_is_known(self, directory: Path) -> None:
+    def test_haproxy_does_not_listen_until_a_replica_is_known(self, directory: Path) -> None:
         """Ray's proxy would keep requests waiting; it is a backup in case of faults, once there were replicas."""
 
         def listens() -> bool:
@@ -193,49 +188,6 @@ class TestHAProxyConfiguration:
         self.generate(directory, replicas=False)
         self.start(directory)
         assert listens(), "haproxy_script.py does not find the routes"
-
-    def test_the_first_haproxy_with_a_replica_takes_over_from_the_starting_page(self, directory: Path) -> None:
-        """Each request gets a response: of the page, and then of the replica."""
-        path, binary = directory / "haproxy.cfg", haproxy_script.find_haproxy()
-        assert binary is not None
-        ports = dict(zip((HTTP, GRPC, STATS, METRICS, 40000), haproxy.free_ports(5), strict=True))
-        text = path.read_text()
-        for port, free in ports.items():
-            text = re.sub(rf":{port}\b", f":{free}", text)
-        path.write_text(text)
-        script = haproxy_script.install(directory, binary, ports[STATS], ports[METRICS])
-        replica = ThreadingHTTPServer(("127.0.0.1", ports[40000]), Replica)
-        threading.Thread(target=replica.serve_forever, daemon=True).start()
-        url, answered = f"http://127.0.0.1:{ports[HTTP]}/v1/health/ready", list[int]()
-
-        def answer(wanted: int) -> bool:
-            answered.append(httpx.get(url, trust_env=False).status_code)
-            return answered[-1] == wanted
-
-        with starting_page(directory, binary, "127.0.0.1", ports[HTTP], ports[GRPC]):
-            until(lambda: not haproxy.is_free("127.0.0.1", ports[HTTP]))
-            assert answer(503)
-            with subprocess.Popen([script, "-db", "-f", path], stderr=subprocess.DEVNULL):
-                try:
-                    until(lambda: answer(200))
-                finally:
-                    haproxy.stop(directory)
-                    replica.shutdown()
-                    replica.server_close()
-        assert set(answered) == {503, 200}
-        assert haproxy.processes(directory) == []
-
-
-class Replica(BaseHTTPRequestHandler):
-    """Responds with 200 to every request."""
-
-    def do_GET(self) -> None:
-        self.send_response(200)
-        self.send_header("content-length", "0")
-        self.end_headers()
-
-    def log_message(self, *_: object) -> None:
-        """Print nothing."""
 
 
 @pytest.mark.parametrize("name", ["proxy.ProxyActor", "haproxy.HAProxyManager"])

@@ -1,4 +1,4 @@
-"""Each server has its own HAProxy: its files, ports and limits, its page while the server starts, and its end."""
+"""Each server has its own HAProxy: its files, ports and limits, and its end."""
 
 import os
 import socket
@@ -9,15 +9,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-import grpc
 import httpx
-import psutil
 import pytest
 from starlette.types import Receive, Scope, Send
 
 from league.errors import ConfigError, NotReady
 from serve_app.runtime import haproxy, haproxy_script
-from serve_app.runtime.starting_page import starting_page
 from tests.support.ipv6 import needs_ipv6
 from tests.support.servers.http_protocol import serving
 from tests.support.waiting import until
@@ -76,21 +73,33 @@ def test_the_files_of_a_killed_server_are_removed(directories: Path) -> None:
 
 
 SERVER = """
-import signal, sys
+import signal, subprocess, sys
 from pathlib import Path
 from serve_app.runtime import haproxy
-from serve_app.runtime.starting_page import starting_page
 
-folder, binary, port = sys.argv[1:]
+folder, binary, text = sys.argv[1:]
 haproxy.DIRECTORIES = Path(folder)
-with haproxy.private_directory() as directory, starting_page(directory, binary, "127.0.0.1", int(port), None):
+with haproxy.private_directory() as directory:
+    configuration = directory / "haproxy.cfg"
+    configuration.write_text(text)
+    subprocess.Popen([binary, "-db", "-f", configuration])
     signal.pause()
+"""
+ANSWERING = """defaults
+    mode http
+    timeout connect 1s
+    timeout client 10s
+    timeout server 10s
+frontend http_frontend
+    bind 127.0.0.1:{port}
+    http-request return status 503
 """
 
 
 def test_a_killed_server_leaves_neither_haproxy_nor_files(directories: Path) -> None:
     (port,) = haproxy.free_ports(1, "127.0.0.1")
-    with subprocess.Popen([sys.executable, "-c", SERVER, str(directories), BINARY, str(port)]) as server:
+    arguments = (str(directories), BINARY, ANSWERING.format(port=port))
+    with subprocess.Popen([sys.executable, "-c", SERVER, *arguments]) as server:
         until(lambda: not haproxy.is_free("127.0.0.1", port))
         server.kill()
     until(lambda: haproxy.is_free("127.0.0.1", port), seconds=60)
@@ -161,58 +170,6 @@ def test_servers_that_start_at_the_same_time_do_not_draw_the_same_ports() -> Non
     assert len(set(claimed)) == 5
 
 
-@pytest.fixture
-def ports(tmp_path: Path) -> Iterator[tuple[int, int]]:
-    http, rpc = haproxy.free_ports(2, "127.0.0.1")
-    with starting_page(tmp_path, BINARY, "127.0.0.1", http, rpc):
-        until(lambda: not haproxy.is_free("127.0.0.1", http))
-        yield http, rpc
-
-
-def test_http_requests_are_answered_with_503_and_a_page_or_a_document(ports: tuple[int, int]) -> None:
-    with httpx.Client(base_url=f"http://127.0.0.1:{ports[0]}", trust_env=False) as client:
-        for path, accept in (("/", "*/*"), ("/leagues/board", "text/html,application/xml;q=0.9")):
-            page = client.get(path, headers={"accept": accept})
-            assert (page.status_code, page.headers["content-type"]) == (503, "text/html")
-            assert "The server is starting" in page.text
-        message = "the server is starting: repeat the request"
-        for path, expected in (
-            ("/v1/health/ready", {"code": "not_ready", "message": message}),
-            ("/v2/health/ready", {"error": message}),
-        ):
-            response = client.get(path)
-            assert (response.status_code, response.headers["retry-after"]) == (503, "1")
-            assert response.json() == expected
-        assert client.post("/v1/policies/board/action", json={}).status_code == 503
-
-
-@needs_ipv6
-def test_the_page_is_served_on_addresses_of_ipv6(tmp_path: Path) -> None:
-    for host in ("::1", "::"):
-        http, rpc = haproxy.free_ports(2, host)
-        with starting_page(tmp_path, BINARY, host, http, rpc):
-            until(lambda host=host, http=http: not haproxy.is_free(host, http))
-            assert httpx.get(f"http://[::1]:{http}/v1/leagues", trust_env=False).status_code == 503
-
-
-def test_grpc_calls_are_answered_with_unavailable(ports: tuple[int, int]) -> None:
-    with grpc.insecure_channel(f"127.0.0.1:{ports[1]}") as channel, pytest.raises(grpc.RpcError) as caught:
-        channel.unary_unary("/inference.GRPCInferenceService/ServerReady")(b"", timeout=20)
-    assert caught.value.code() == grpc.StatusCode.UNAVAILABLE
-    assert "starting" in caught.value.details()
-
-
-def test_the_page_can_be_replaced_and_leaves_its_port_free(tmp_path: Path) -> None:
-    (port,) = haproxy.free_ports(1, "127.0.0.1")
-    with starting_page(tmp_path, BINARY, "127.0.0.1", port, None):
-        until(lambda: not haproxy.is_free("127.0.0.1", port))
-    assert haproxy.is_free("127.0.0.1", port)
-    with starting_page(tmp_path, BINARY, "127.0.0.1", port, None):
-        process = psutil.Process(int((tmp_path / haproxy_script.STAND_IN).read_text()))
-        process.kill()
-        until(lambda: not process.is_running())  # it is reaped
-
-
 CONFIGURATION = """global
     stats socket {directory}/admin.sock level admin expose-fd listeners
 defaults
@@ -236,7 +193,7 @@ backend replicas
 
 
 def test_haproxy_listens_on_all_ports_after_it_has_taken_over(tmp_path: Path) -> None:
-    """Ray's first HAProxy has no replica and no port of the server; the next one replaces it and the page."""
+    """From a stand-in, and from an HAProxy of Ray that knows no replica, and has no port of the server."""
     http, metrics, stats = haproxy.free_ports(3, "127.0.0.1")
     wrapper = haproxy_script.install(tmp_path, BINARY, stats, metrics)
     configuration = tmp_path / "haproxy.cfg"
@@ -253,7 +210,11 @@ def test_haproxy_listens_on_all_ports_after_it_has_taken_over(tmp_path: Path) ->
 
     with ExitStack() as processes:
         replica = processes.enter_context(socket.create_server(("127.0.0.1", 0)))
-        processes.enter_context(starting_page(tmp_path, BINARY, "127.0.0.1", http, None))
+        (tmp_path / "standin.cfg").write_text(ANSWERING.format(port=http))
+        stand_in = subprocess.Popen([BINARY, "-db", "-f", tmp_path / "standin.cfg"])
+        processes.callback(stand_in.wait)
+        processes.callback(stand_in.kill)
+        (tmp_path / haproxy_script.STAND_IN).write_text(str(stand_in.pid))
         processes.callback((tmp_path / haproxy_script.STOPPED).touch)
         first = start("")
         until(lambda: not haproxy.is_free("127.0.0.1", metrics) and not haproxy.is_free("127.0.0.1", http))
