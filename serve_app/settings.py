@@ -62,7 +62,7 @@ class ServeSettings(BaseModel):
     run_timeout: float = Field(default=3.0, gt=0)
     """How long a run of a policy's graph may occupy a thread of the replica. It is then ended, after its current
     operator, and the request gets 504. Less than `timeout`, so that the request is not answered before."""
-    max_wait: float = Field(default=0.25, gt=0)
+    max_wait: float = Field(default=0.5, gt=0)
     """How long an inference request may wait for others before it starts, nearly; those that would wait for longer are
     refused with 429."""
     require_keys: Literal["auto", "always", "never"] = "auto"

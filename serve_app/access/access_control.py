@@ -166,13 +166,8 @@ class AccessControl:
 
         Raises Unauthenticated, Forbidden, RateLimited or Overloaded.
         """
-        need = for_rpc(rpc, "")
-        key = self._identify(need, _read_headers(headers_of(metadata)).token)
-        if key is not None:
-            _take_token(key)
-        if need.scope == "act":
-            self.backlog.admit()
-        return key
+        need = RequiredPermission(for_rpc(rpc, "").scope, None)
+        return self.admit(need, _read_headers(headers_of(metadata)).token)
 
     def check_model(self, key: ApiKey | None, rpc: str, model: str) -> None:
         """Check that the key of an accepted RPC permits a model. Raises Forbidden."""

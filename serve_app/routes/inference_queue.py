@@ -29,7 +29,7 @@ from serve_app.codecs.request_limits import LARGE_BODY
 from serve_app.inference.batches import GraphRun
 from serve_app.inference.http_route import REPLICA, STARTED, HttpRoute, Reply
 from serve_app.routes.action import PATH_PREFIX, PATH_SUFFIX
-from serve_app.runtime.uvicorn_http import HttpProtocol
+from serve_app.runtime.uvicorn_http import HttpProtocol, header_lines
 
 NOT_PLAIN = frozenset((b"content-encoding", b"expect", b"transfer-encoding", b"x-request-timeout-ms"))
 """Headers of requests for the application."""
@@ -44,13 +44,8 @@ MODELS = "/v2/models/"
 Steps = Coroutine[Any, Any, Reply]
 
 
-@lru_cache(maxsize=1024)
-def _lines(headers: tuple[tuple[bytes, bytes], ...]) -> bytes:
-    return b"".join(b"%b: %b\r\n" % header for header in headers)
-
-
 END = b"\r\n"
-END_WITH_KEY = _lines((KEY_HEADER,)) + END
+END_WITH_KEY = header_lines((KEY_HEADER,)) + END
 
 
 class Target(NamedTuple):
@@ -74,12 +69,14 @@ class InferenceQueue:
         # The application adds the headers for pages of other origins.
         self._not_plain = NOT_PLAIN | ({b"origin"} if self._serving.settings.cors_origins else set())
         self._errors = errors
-        self._replica = _lines(((REPLICA, replica.encode()),))
+        self._replica = header_lines(((REPLICA, replica.encode()),))
         self._arrived: list[HttpProtocol] = []
         """Connections whose request was not admitted yet."""
         self._queue: deque[tuple[int, HttpProtocol]] = deque()
         """Those whose request was, and when: nanoseconds of `perf_counter_ns`."""
         self._has_turn = False
+        self._turn_began = 0.0
+        """When the last turn ended, or the first request arrived after it: other work of the event loop counts, too."""
 
     def takes(self, url: bytes, headers: list[tuple[bytes, bytes]]) -> bool:
         """See `PlainRequests.takes`."""
@@ -100,11 +97,11 @@ class InferenceQueue:
         """See `PlainRequests.add`."""
         self._arrived.append(connection)
         if not self._has_turn:
-            self._has_turn = True
+            self._has_turn, self._turn_began = True, monotonic()
             connection.loop.call_soon(self._take_turn, connection.loop)
 
     def _take_turn(self, loop: AbstractEventLoop) -> None:
-        begin, answered, backlog = monotonic(), 0, self._serving.access.backlog
+        begin, answered = monotonic(), 0
         try:
             self._admit()
             while self._queue and (not answered or monotonic() < begin + SLICE):
@@ -112,7 +109,8 @@ class InferenceQueue:
                 self._answer_group()
         finally:  # whatever happens to one connection
             if answered:
-                backlog.count_answered(answered, monotonic() - begin)
+                began, self._turn_began = self._turn_began, monotonic()
+                self._serving.access.backlog.count_answered(answered, self._turn_began - began)
             self._has_turn = bool(self._queue)
             if self._has_turn:
                 loop.call_soon(self._take_turn, loop)
@@ -157,7 +155,7 @@ class InferenceQueue:
         except StopIteration as done:
             reply: Reply = done.value
             length = b"content-length: %d\r\n" % len(reply.body)
-            self._reply(connection, 200, _lines(reply.headers) + length + self._replica, reply.body)
+            self._reply(connection, 200, header_lines(reply.headers) + length + self._replica, reply.body)
         except Exception as error:
             self._refuse(connection, error)
         else:
@@ -170,7 +168,7 @@ class InferenceQueue:
     def _refuse(self, connection: HttpProtocol, error: Exception) -> None:
         path = self._target(connection).path
         response = self._errors.response(path, error)
-        self._reply(connection, response.status_code, _lines(tuple(response.raw_headers)), bytes(response.body))
+        self._reply(connection, response.status_code, header_lines(tuple(response.raw_headers)), bytes(response.body))
 
     def _reply(self, connection: HttpProtocol, status: int, lines: bytes, body: bytes) -> None:
         admission: Admission | None = cast(Scope, connection.scope).get(ADMISSION)

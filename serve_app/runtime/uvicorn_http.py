@@ -99,15 +99,10 @@ def _is_loopback(address: str) -> bool:
     return ip_address(address).is_loopback
 
 
-_lines: tuple[list[tuple[bytes, bytes]], bytes] = [], b""
-"""The default headers of the last response, and their lines. uvicorn replaces the list every second."""
-
-
-def _header_lines(headers: list[tuple[bytes, bytes]]) -> bytes:
-    global _lines
-    if _lines[0] is not headers:
-        _lines = headers, b"".join(b"%b: %b\r\n" % header for header in headers)
-    return _lines[1]
+@lru_cache(maxsize=1024)
+def header_lines(headers: tuple[tuple[bytes, bytes], ...]) -> bytes:
+    """Headers as lines of a response. The same few recur."""
+    return b"".join(b"%b: %b\r\n" % header for header in headers)
 
 
 NO_SNIFFING = (b"x-content-type-options", b"nosniff")
@@ -271,7 +266,7 @@ class HttpProtocol(HttpToolsProtocol):
         """Send the response to a plain request. head: its header lines and an empty line."""
         self.is_waiting, self.body = False, b""
         if not self.transport.is_closing():
-            default = _header_lines(self.server_state.default_headers)
+            default = header_lines(tuple(self.server_state.default_headers))
             self.transport.write(b"".join((STATUS_LINE[status], default, head, body)))
             self.on_response_complete()
 
