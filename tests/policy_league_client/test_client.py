@@ -15,9 +15,8 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from policy_league_client import AsyncClient, Client, retries
 from serve_app.access import api_keys
-from serve_app.live_versions.traffic_split import key_position
 from serve_app.runtime import uvicorn_websocket
-from tests.support.clients.actions import board_arrays, boards
+from tests.support.clients.actions import board_arrays, boards, key_position
 from tests.support.clients.sync_and_async import Connect
 from tests.support.policies.graphs import masked_mlp
 from tests.support.servers.streaming import Listening, listening

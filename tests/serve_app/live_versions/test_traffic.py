@@ -19,7 +19,7 @@ from league.policies.onnx import OnnxPolicy
 from league.policies.policy import Actions
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
-from league.registry.storage.manifest import Mixture, episode_position
+from league.registry.storage.manifest import Mixture
 from league.registry.storage.rows import Portion
 from league.settings import Storage
 from policy_league_client.endpoint import Endpoint
@@ -29,7 +29,6 @@ from policy_league_client.stream_protocol import StreamProtocol
 from serve_app.app import Replica
 from serve_app.live_versions.policies import LoadedPolicy
 from serve_app.live_versions.shadow import Shadow
-from serve_app.live_versions.traffic_split import CANARY
 from tests.support.clients.actions import (
     BOARD,
     act,
@@ -37,6 +36,7 @@ from tests.support.clients.actions import (
     boards,
     change,
     inference,
+    key_position,
     rejected,
     version_for,
 )
@@ -65,10 +65,6 @@ def test_keys_are_spread_evenly_and_differently_in_each_league() -> None:
     assert 60 < sum(at < 0.5 for at in positions) < 140
     assert positions != [key_position("duo", key.encode()) for key in KEYS]
     assert key_position("board", b"player-0") == 0.47714954489280714, "stable across replicas and releases"
-
-
-def key_position(league: str, key: bytes) -> float:
-    return episode_position(league, key, CANARY)
 
 
 def versions_by_key(client: TestClient) -> dict[str, int]:

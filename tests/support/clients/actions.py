@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from starlette.testclient import TestClient
 
+from league.registry.storage.manifest import episode_position
+from serve_app.live_versions.traffic_split import CANARY
+
 BOARD = {"observation": np.zeros((6, 7, 2), int).tolist(), "action_mask": [1] * 7}
 DATATYPES = {"int8": "INT8", "int64": "INT64", "float32": "FP32"}
 
@@ -48,6 +51,11 @@ def version_for(client: TestClient, key: str | None = None, **params: str) -> in
     reply = client.post("/v1/policies/board/action", json={"observation": BOARD}, headers=headers, params=params)
     assert reply.status_code == 200, reply.text
     return int(reply.json()["version"])
+
+
+def key_position(league: str, key: bytes) -> float:
+    """A key below the share of a canary is answered by it."""
+    return episode_position(league, key, CANARY)
 
 
 def rejected(client: TestClient, body: Any, status: int = 400, model: str = "board", **more: Any) -> dict[str, str]:
