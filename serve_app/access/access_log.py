@@ -3,8 +3,8 @@
     {"time": "2026-03-03T14:00:00.123Z", "method": "POST", "route": "/v1/policies/connect_four/action",
      "policy": "connect_four", "version": 4, "status": 200, "us": 83, "key": "game-server"}
 
-`us` is the time spent in the replica in microseconds. `key` is the name of the API key, never its text. A thread writes
-the lines. If the disk is full, they are lost; requests are unaffected.
+`us` is the time spent in the replica in microseconds. `key` is the name of the API key, never its text. Lines
+are written together, in a thread. If the disk is full, they are lost; requests are unaffected.
 """
 
 import asyncio
@@ -14,17 +14,19 @@ from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from io import TextIOWrapper
 from logging import LogRecord, makeLogRecord
-from logging.handlers import QueueListener, RotatingFileHandler
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
-from queue import SimpleQueue
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, cast
 
 import orjson
 from starlette.types import Message, Scope, Send
 
+from serve_app.runtime.background import in_background
 from serve_app.runtime.ray_serve import logger
 
+WRITE_INTERVAL = 0.5
+"""Seconds between two writes."""
 MAX_WAITING = 20_000
 """Maximum number of lines that wait to be written; further ones are dropped."""
 MAX_FILE_BYTES, BACKUP_COUNT = 64 * 2**20, 4
@@ -37,7 +39,7 @@ class AccessLog:
     """Writes `access-<replica>.jsonl` in a directory. All methods run on the event loop."""
 
     def __init__(self, directory: Path, replica: str) -> None:
-        self._records = SimpleQueue[LogRecord]()
+        self._lines: list[dict[str, Any]] = []
         self._file = _File(directory / f"access-{replica}.jsonl")
 
     def begin(self, scope: Scope, path: str, send: Send) -> Send:
@@ -54,25 +56,34 @@ class AccessLog:
             is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
             if is_end or message["type"] == "websocket.close":
                 line["time"], line["us"] = datetime.now(UTC), (perf_counter_ns() - start) // 1000
-                if self._records.qsize() < MAX_WAITING:
-                    self._records.put(makeLogRecord({"msg": line}))
+                if len(self._lines) < MAX_WAITING:
+                    self._lines.append(line)
 
         return noting
 
     @asynccontextmanager
     async def writing(self) -> AsyncIterator[None]:
         """Write lines while the context is active, and the remaining ones on exit."""
-        listener = QueueListener(self._records, self._file)
-        listener.start()
         try:
-            yield
+            async with in_background(self._write_on()):
+                yield
         finally:
-            await asyncio.to_thread(listener.stop)
+            await self._write()
             self._file.close()
+
+    async def _write_on(self) -> None:
+        while True:
+            await asyncio.sleep(WRITE_INTERVAL)
+            await self._write()
+
+    async def _write(self) -> None:
+        lines, self._lines = self._lines, []
+        if lines:
+            await asyncio.to_thread(self._file.emit, makeLogRecord({"msg": lines}))
 
 
 class _File(RotatingFileHandler):
-    """A file that is opened, with its directory, when the first line is written."""
+    """A file that is opened, with its directory, when the first lines are written."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, maxBytes=MAX_FILE_BYTES, backupCount=BACKUP_COUNT, delay=True)
@@ -83,9 +94,9 @@ class _File(RotatingFileHandler):
         return super()._open()
 
     def format(self, record: LogRecord) -> str:
-        return orjson.dumps(record.msg, option=orjson.OPT_UTC_Z).decode()
+        return "\n".join(orjson.dumps(line, option=orjson.OPT_UTC_Z).decode() for line in cast(list[Any], record.msg))
 
-    def flush(self) -> None:  # after each line
+    def flush(self) -> None:  # after each write
         super().flush()
         self._has_failed = False
 
