@@ -93,7 +93,3 @@ class Serving:
             greedy = None if policy.is_sampled(options) else answer.actions
             mirror({port.name: inputs[port.name] for port in policy.observed}, state, greedy)
         return answer
-
-    def count(self, api: str, policy: LoadedPolicy, rows: int, begun: int) -> None:
-        """Count an answered request. begun: a time of `perf_counter_ns`."""
-        self.metrics.count_request(api, policy, rows, perf_counter_ns() - begun)

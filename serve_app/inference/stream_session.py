@@ -129,7 +129,7 @@ class StreamSession:
         if return_state and self._state is not None:
             response["state"] = self._tokens()
         message = self._signed(response)
-        self._serving.count(API, policy, observations.rows, start)
+        self._serving.metrics.count_request(API, policy, observations.rows, start)
         return message
 
     async def _answer_binary(self, data: bytes) -> StreamMessage:
@@ -140,7 +140,7 @@ class StreamSession:
         answer = await self._serving.act(policy, observations, request.options, state)
         self._policy, self._state, self._is_batch = policy, answer.output.state, request.rows > 1
         message = StreamMessage(write_actions(policy, answer.actions), False)
-        self._serving.count(API, policy, request.rows, start)
+        self._serving.metrics.count_request(API, policy, request.rows, start)
         return message
 
     async def _select(

@@ -89,7 +89,7 @@ class Inference:
             raise
         rows, done = observations.rows, perf_counter_ns()
         entry.succeed(rows, begun, answer.started, answer.read, answer.ran, done, answer.runs)
-        self.serving.count(API, policy, rows, begun)
+        self.serving.metrics.count_request(API, policy, rows, begun)
         return encoded
 
 

@@ -8,7 +8,7 @@ for Prometheus.
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import monotonic, time
+from time import monotonic, perf_counter_ns, time
 from typing import Any
 
 from league.histograms import Histogram
@@ -64,15 +64,15 @@ class Metrics:
         self._errors: Counter[tuple[str, str]] = Counter()
         self._started_at = time()
 
-    def count_request(self, api: str, policy: LoadedPolicy, rows: int, ns: int) -> None:
-        """Count a request of `rows` observations that took `ns` nanoseconds."""
+    def count_request(self, api: str, policy: LoadedPolicy, rows: int, begun: int) -> None:
+        """Count a request of `rows` observations that is answered now. begun: a time of `perf_counter_ns`."""
         label = (policy.league, policy.name, policy.number, api)
         served = self._served.get(label)
         if served is None:
             if len(self._served) >= MAX_SERIES:
                 del self._served[min(self._served, key=lambda known: self._served[known].used_at)]
             served = self._served[label] = RequestStats(used_at=monotonic())
-        served.add(rows, ns)
+        served.add(rows, perf_counter_ns() - begun)
 
     def count_error(self, path: str, code: str) -> None:
         """Count an error response or a refused request."""

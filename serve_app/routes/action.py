@@ -98,5 +98,5 @@ class ActionRoute(HttpRoute):
             tokens = encode_state(state, policy)
             response["state"] = tokens if request.is_batch else tokens[0]
         content = orjson.dumps(response)[:-1] + policy.signature(model)
-        self.serving.count(API, policy, observations.rows, begun)
+        self.serving.metrics.count_request(API, policy, observations.rows, begun)
         return Reply(policy.number, content)

@@ -59,12 +59,13 @@ async def relay(
 ) -> None:
     """Pass messages on until one side closes, or `until` says how to close. admit_frame: see MessageHandler."""
     messages = _Messages(admit_frame)
-    ends = [asyncio.ensure_future(work) for work in (_closed(receive), _downwards(send, gateway), until)]
-    tasks = [*ends, asyncio.create_task(messages.pass_on(gateway))]
+    ends = [asyncio.ensure_future(work) for work in (_downwards(send, gateway), until)]
+    # The simulator's connection passes on that it was closed, and nothing else.
+    tasks = [*ends, asyncio.ensure_future(receive()), asyncio.create_task(messages.pass_on(gateway))]
     connection: StreamWebSocketProtocol = scope["extensions"][STREAM_PROTOCOL]
     connection.set_handler(messages)
     try:
-        ended, _ = await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         close = next((task.result() for task in ends if task in ended), None)
     finally:
         for task in tasks:
@@ -73,11 +74,6 @@ async def relay(
     if close is not None:
         with suppress(Exception):  # the simulator may have gone at the same time
             await send({"type": "websocket.close", "code": close.code, "reason": close.reason})
-
-
-async def _closed(receive: Receive) -> None:
-    """Wait until the simulator has closed."""
-    await receive()
 
 
 async def _downwards(send: Send, gateway: ClientConnection) -> CloseFrame:
