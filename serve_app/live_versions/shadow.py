@@ -75,7 +75,7 @@ class MirroredRequest(NamedTuple):
 
 
 class Shadow:
-    """Mirrors requests to candidates. Its methods run on the event loop."""
+    """Mirrors requests to candidates. Its public methods run on the event loop."""
 
     def __init__(self, slots: AliasSlots, traffic: TrafficSplit, settings: ServeSettings) -> None:
         self._slots = slots

@@ -23,7 +23,7 @@ Headers = Iterable[tuple[bytes, bytes]]
 
 
 class TrafficSplit:
-    """The traffic settings that a replica applies. All methods run on the event loop."""
+    """The traffic settings that a replica applies. They are changed on the event loop, and read by the shadow, too."""
 
     def __init__(self, slots: AliasSlots) -> None:
         self._slots = slots

@@ -149,7 +149,8 @@ class StreamRoute:
                 try:
                     self._serving.access.check_key(key)
                 except Unauthenticated as error:
-                    connection.end(POLICY_VIOLATION, str(error))
+                    # Not at once: a stream that cannot be closed must not prevent that others are.
+                    asyncio.get_running_loop().call_soon(connection.end, POLICY_VIOLATION, str(error))
 
     def _reconnect(self, times: ClosingTimes) -> None:
         """Close the open streams at random times, or earlier if that was decided before."""
