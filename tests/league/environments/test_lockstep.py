@@ -20,7 +20,7 @@ from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build
 from league.environments.lockstep import Lockstep, stock_stepping
 from league.environments.stepping import BatchedEnvironment, Turn, each_agent_alone
-from league.errors import ConfigError, EnvironmentMismatch, IllegalAction, InvalidReward, LeagueError
+from league.errors import ConfigError, EnvironmentMismatch, IllegalAction, InvalidReward
 from tests.conformance.stepping import (
     assert_same_episode,
     assert_stepping_conforms,
@@ -140,20 +140,6 @@ def test_agents_terminate_once_and_an_episode_without_agents_is_over() -> None:
     assert [env_index for turn in turns for env_index in turn.finished.tolist()] == [0]
 
 
-def test_contract_violations_are_rejected_with_the_agent(subtests: pytest.Subtests) -> None:
-    for fault, message in (
-        ("empty", "the episode with seed 5 ends at its reset"),
-        ("mute", "agent_1 is in `agents`, but has no observation"),
-        ("flown", "agent_1 has left the environment neither terminated nor truncated"),
-        ("stranger", "'agent_7' has an observation, but is not in possible_agents"),
-        ("misshapen", r"agent_1 observes observation with shape \[2\], but its space has \[3\]"),
-    ):
-        for groups in ([0, 1], [0, 0]):
-            env = stock_stepping(of_class(ContractViolation, fault=fault), 1, crashes=3)
-            with subtests.test(fault=fault, groups=groups), pytest.raises(LeagueError, match=message):
-                env.step(zeros(env.start(episodes([5], groups))))
-
-
 def test_without_a_state_or_a_request_there_are_none() -> None:
     for make, states in ((tictactoe_v3.env, True), (StateInInfo, False)):
         assert all(pair == ({}, {}) for pair in turns_of(make, 4, states))
@@ -214,31 +200,6 @@ class NoAllFlag(RLlibSimultaneous):
         assert self.time <= 2, "step without agents"
         agent = f"agent_{self.time - 1}"
         return {"agent_1": self._observe()}, {}, {agent: True, "__all__": False}, {"__all__": False}, {}
-
-
-class ContractViolation(Simultaneous):
-    """Violates the contract as `fault` says."""
-
-    def __init__(self, fault: str) -> None:
-        super().__init__()
-        self.fault = fault
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        observations, infos = super().reset(seed, options)
-        return ({}, {}) if self.fault == "empty" else (observations, infos)
-
-    def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
-        observations, *reports = super().step(actions)
-        match self.fault:
-            case "mute":
-                del observations["agent_1"]
-            case "flown":
-                self.agents = ["agent_0"]
-            case "stranger":
-                observations["agent_7"] = observations["agent_0"]
-            case "misshapen":
-                observations["agent_1"] = observations["agent_1"][:2]
-        return observations, *reports
 
 
 LENGTH = 3

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from league.config.environment import EnvironmentConfig
 from league.environments.implementation import implementation, stepping
 from league.environments.lockstep import stock_stepping
-from league.environments.stepping import Batch, BatchedEnvironment, Starts, Turn
+from league.environments.stepping import Batch, Turn
 from league.environments.vector.leduc_holdem import LeducHoldem
 from league.environments.vector.vector_env import AgentRows
 from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward
-from league.spaces import ACTION_MASK
 from tests.conformance.stepping import states_of
 from tests.support.environments import vector_copies
 from tests.support.environments.episodes import episodes
+from tests.support.environments.player import Player
 
 COPIES = vector_copies.__name__
 
@@ -42,44 +42,6 @@ ENVIRONMENTS = {
     "crashing": copied("VectorMeeting", crashes=list(range(0, 2**31, 2**28)) + list(range(0, 60, 7))),
     "turns, early deaths": copied("VectorCounting", lives=[1, 4, 2, 4], truncated=[1, 2]),
 }
-
-
-class Player:
-    """Plays a batched environment, with everything the protocol allows, by draws of one generator."""
-
-    def __init__(self, env: BatchedEnvironment, seed: int) -> None:
-        self.env, self.rng = env, np.random.default_rng(seed)
-        self.seeds = iter(range(10_000))
-
-    def next_episodes(self, envs: NDArray) -> Starts:
-        starting = envs[self.rng.random(len(envs)) < 0.9]
-        seeds = np.array([next(self.seeds) for _ in starting], np.int64)
-        return Starts(starting, seeds, self.groups(len(starting)))
-
-    def groups(self, m: int) -> NDArray:
-        """Agents of different spaces are never in one group."""
-        return np.arange(len(self.env.agents)) + len(self.env.agents) * self.rng.integers(3, size=(m, 1))
-
-    def start(self) -> Turn:
-        self.turn = self.env.start(self.next_episodes)
-        return self.turn
-
-    def step(self) -> Turn:
-        playing = np.unique(np.concatenate([np.zeros(0, int), *(batch.envs for batch in self.turn.batches.values())]))
-        abandoned = playing[self.rng.random(len(playing)) < 0.05]
-        actions = {group: self.actions(batch) for group, batch in self.turn.batches.items()}
-        kept = {group: batch.without(abandoned) for group, batch in self.turn.batches.items()}
-        self.env.abandon(abandoned)
-        regrouped = playing[self.rng.random(len(playing)) < 0.2]
-        self.env.assign(regrouped, self.groups(len(regrouped)))
-        self.turn = self.env.step({group: actions[group][rows] for group, rows in kept.items()})
-        return self.turn
-
-    def actions(self, batch: Batch) -> NDArray:
-        mask = batch.observations.get(ACTION_MASK)
-        if mask is None:
-            return self.rng.integers(2, size=len(batch))
-        return (self.rng.random(mask.shape) * mask).argmax(axis=1)
 
 
 def assert_same_rows(vector: AgentRows | Batch, expected: AgentRows | Batch) -> None:
