@@ -4,8 +4,9 @@ import re
 from ipaddress import ip_address
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from league.config.base import Part
 from league.policies.policy import MAX_BATCH
 from league.registry.replicas import LIVENESS_TIMEOUT
 
@@ -23,15 +24,13 @@ def is_exposed(host: str) -> bool:
         return True  # a host name may resolve to any interface
 
 
-class ServeSettings(BaseModel):
+class ServeSettings(Part):
     """Settings of the service. Times are in seconds, sizes in bytes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     root_path: str = ""
     """Path below which a proxy serves this server, such as `/ai`. The proxy may leave it in the paths of requests, or
     remove it."""
-    cors_origins: list[str] = []
+    cors_origins: list[str] = Field(default=[])
     """Origins such as `https://game.example` whose pages may call this server from a browser. All requests then need an
     API key, which such a page sends like any client, or for a stream as a WebSocket subprotocol."""
     max_body: int = Field(default=4 * 2**20, ge=1024)
@@ -52,7 +51,7 @@ class ServeSettings(BaseModel):
     """Open event streams of one API key per replica; further ones are refused with 429."""
     max_batch: int = Field(default=MAX_BATCH, ge=1)
     """Maximum observations in one request."""
-    unbatched: list[str] = []
+    unbatched: list[str] = Field(default=[])
     """Models whose requests are never run together with those of other callers: `{league}`, or `{league}.{policy}` if
     its versions have several policies."""
     timeout: float = Field(default=4.5, gt=0)

@@ -95,9 +95,10 @@ def environment_hooks(config: EnvironmentConfig) -> EnvironmentHooks:
         metadata = getattr(env, "metadata", None) or {}
         has_views = callable(getattr(getattr(env, "unwrapped", env), "render_for", None))
     draws = "rgb_array" in (metadata.get("render_modes") or ())
+    document = {**KNOWN.get(str(metadata.get("name")), {}), **metadata}
     try:
-        declared = Declarations.model_validate({**KNOWN.get(str(metadata.get("name")), {}), **metadata})
+        declared = Declarations.model_validate(document)
     except ValidationError as error:
-        fault = describe_validation_error(Declarations, error)
+        fault = describe_validation_error(error, document)
         raise EnvironmentMismatch(f"metadata of {config.entry_point}: {fault}") from error
     return EnvironmentHooks(draws, draws and has_views, declared)

@@ -45,9 +45,6 @@ class OwnSettings(TrainingSettings, extra="allow"):
         return installed[value].value
 
 
-MODELS: dict[str, type[TrainingSettings]] = {**ALGORITHMS, OWN: OwnSettings}
-
-
 def _tag(settings: Any) -> str:
     has_keys = isinstance(settings, Mapping)
     name = str(settings.get("algorithm", "ppo") if has_keys else getattr(settings, "algorithm", "ppo"))
@@ -58,6 +55,9 @@ if TYPE_CHECKING:
     TrainingConfig = TrainingSettings
 else:
     TrainingConfig = SerializeAsAny[
-        Annotated[Union[*(Annotated[model, Tag(name)] for name, model in MODELS.items())], Discriminator(_tag)]
+        Annotated[
+            Union[*(Annotated[model, Tag(name)] for name, model in {**ALGORITHMS, OWN: OwnSettings}.items())],
+            Discriminator(_tag),
+        ]
     ]
 """Settings of one algorithm, discriminated by `algorithm`."""

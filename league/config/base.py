@@ -1,8 +1,11 @@
 """Base of all sections of a configuration."""
 
+from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Annotated, Any
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from league.errors import InvalidReference
 from league.frozen import FrozenModel
@@ -12,7 +15,25 @@ JSON = dict[str, Any]
 
 
 class Part(FrozenModel, allow_inf_nan=False):
-    """Base of configuration models, which rejects non-finite numbers too."""
+    """Base of what users write. It rejects non-finite numbers too, and says which keys there are."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_known_keys(cls, value: Any) -> Any:
+        if not isinstance(value, Mapping) or cls.model_config["extra"] != "forbid":
+            return value
+        names = sorted(field.alias or name for name, field in cls.model_fields.items())
+        faults, choices = [], f", expected one of {', '.join(names)}"
+        for key in (str(key) for key in value if key not in names):
+            if guesses := get_close_matches(key, names, n=1):
+                message = f"unknown key, did you mean {guesses[0]!r}?"
+            else:
+                message, choices = f"unknown key{choices}", ""
+            fault = PydanticCustomError("unknown_key", "{message}", {"message": message})
+            faults.append(InitErrorDetails(type=fault, loc=(key,), input=None))
+        if faults:
+            raise ValidationError.from_exception_data(cls.__name__, faults)
+        return value
 
 
 def _check_contestant(ref: str) -> str:

@@ -82,9 +82,9 @@ class LeagueConfig(Part):
     @classmethod
     def _exploiters_can_be_trained(cls, value: TrainingConfig) -> TrainingConfig:
         try:
-            type(value).model_validate(value.model_dump(by_alias=True) | value.exploiter)
+            type(value).model_validate(settings := value.model_dump(by_alias=True) | value.exploiter)
         except ValidationError as error:
-            raise ValueError(f"exploiter.{describe_validation_error(type(value), error)}") from error
+            raise ValueError(f"exploiter.{describe_validation_error(error, settings)}") from error
         return value
 
     @model_validator(mode="after")
@@ -132,7 +132,7 @@ class LeagueConfig(Part):
         try:
             return cls.model_validate(document)
         except ValidationError as error:
-            raise ConfigError(f"{source}: {describe_validation_error(cls, error)}") from error
+            raise ConfigError(f"{source}: {describe_validation_error(error, document)}") from error
 
     @property
     def training_openings(self) -> int:
@@ -225,9 +225,9 @@ def typed(settings: TrainingSettings) -> TrainingSettings:
     if (model := IMPORTED.get(settings.algorithm)) is None:
         return settings
     try:
-        return model.model_validate(settings.model_dump(by_alias=True, exclude_unset=True))
+        return model.model_validate(document := settings.model_dump(by_alias=True, exclude_unset=True))
     except ValidationError as error:
-        raise ValueError(f"{describe_validation_error(model, error)} ({settings.algorithm})") from error
+        raise ValueError(f"{describe_validation_error(error, document)} ({settings.algorithm})") from error
 
 
 def _large_integers(value: Any, key: str = "") -> Iterator[str]:

@@ -55,8 +55,6 @@ def _schedule_form(value: Any) -> str:
     return "points" if isinstance(value, list | tuple) else "constant"
 
 
-SCHEDULE_FORMS = ("annealing", "points", "constant")
-"""Pydantic includes them in the paths of errors."""
 _Annealing = Annotated[AnnealingConfig, Tag("annealing")]
 _Points = Annotated[Points, AfterValidator(_check_points), Tag("points")]
 Scheduled = Annotated[

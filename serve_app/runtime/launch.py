@@ -228,10 +228,11 @@ def _omit_statistics(deployment: dict[str, Any]) -> None:
 
 def _settings(document: dict[str, Any]) -> ServeSettings:
     """The settings of the replicas. Raises ConfigError."""
+    arguments = document["applications"][0].get("args", {})
     try:
-        return ServeSettings.model_validate(document["applications"][0].get("args", {}))
+        return ServeSettings.model_validate(arguments)
     except ValidationError as error:
-        raise ConfigError(f"deploy.yaml: args: {describe_validation_error(ServeSettings, error)}") from error
+        raise ConfigError(f"deploy.yaml: args: {describe_validation_error(error, arguments)}") from error
 
 
 def _check_exposure(document: dict[str, Any], storage: Storage) -> None:

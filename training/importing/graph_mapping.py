@@ -8,9 +8,9 @@ import yaml
 from onnx.helper import tensor_dtype_to_np_dtype
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from league.config.base import Part
 from league.config.validation_errors import describe_validation_error, describe_yaml_error
 from league.errors import ConfigError, EnvironmentMismatch
-from league.frozen import FrozenModel
 from league.interface import AgentInterface
 from league.policies.actions import dist_inputs_size
 from league.spaces import ACTION_MASK, Box, DictSpace, inputs
@@ -18,7 +18,7 @@ from league.spaces import ACTION_MASK, Box, DictSpace, inputs
 Kind = Literal["logits", "probabilities", "values", "gaussian", "action"]
 
 
-class InputMapping(FrozenModel):
+class InputMapping(Part):
     """What an input of a graph receives."""
 
     name: str
@@ -43,7 +43,7 @@ class InputMapping(FrozenModel):
         return tuple(shape[axis] for axis in self.transpose) if self.transpose else shape
 
 
-class GraphMapping(FrozenModel):
+class GraphMapping(Part):
     """Names of a graph's tensors and the meaning of its output."""
 
     inputs: dict[str, InputMapping]
@@ -62,11 +62,11 @@ class GraphMapping(FrozenModel):
     def load(cls, path: Path) -> Self:
         """Read a YAML file. Raises ConfigError, which names the file and the key."""
         try:
-            return cls.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+            return cls.model_validate(document := yaml.safe_load(path.read_text(encoding="utf-8")))
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror or error}") from error
         except ValidationError as error:
-            raise ConfigError(f"{path}: {describe_validation_error(cls, error)}") from error
+            raise ConfigError(f"{path}: {describe_validation_error(error, document)}") from error
         except (yaml.YAMLError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: {describe_yaml_error(error)}") from error
 

@@ -339,7 +339,7 @@ def _record(found: str | dict[str, Any], source: str) -> RunRecord:
     try:
         return RunRecord.model_validate_json(found) if isinstance(found, str) else RunRecord.model_validate(found)
     except ValidationError as error:
-        raise RunCorrupt(f"{source}: {describe_validation_error(RunRecord, error)}") from error
+        raise RunCorrupt(f"{source}: {describe_validation_error(error, found)}") from error
 
 
 def _wait_for_other_machine(registry: Registry, league: str, run: str) -> None:

@@ -16,6 +16,7 @@ from pydantic import AwareDatetime, Field, ValidationError, model_validator
 
 from league.conditions import VALUE_BASED
 from league.config.environment import EnvironmentConfig
+from league.config.validation_errors import describe_validation_error
 from league.errors import ArtifactCorrupt, InvalidInput
 from league.frozen import FrozenModel
 from league.interface import Interface
@@ -255,6 +256,4 @@ class Manifest(FrozenModel):
         try:
             return cls.model_validate_json(text)
         except ValidationError as error:
-            from league.config.validation_errors import describe_validation_error  # imports all algorithms' settings
-
-            raise ArtifactCorrupt(f"{source}: {describe_validation_error(cls, error)}") from error
+            raise ArtifactCorrupt(f"{source}: {describe_validation_error(error, text)}") from error

@@ -61,9 +61,11 @@ ONE_OF = f"{', '.join(ALGORITHMS)}, or package.module:Class"
 WHOLE_MESSAGES: list[tuple[dict[str, Any], str]] = [
     (
         training(opponents={"fixed": [{"reff": "@1"}]}),
-        "training.opponents.fixed[0].reff: unknown key, did you mean 'ref'?;"
-        " training.opponents.fixed[0].share: missing, but required",
+        "training.opponents.fixed[0].reff: unknown key, did you mean 'ref'?",
     ),
+    (training(opponents=[{"ref": "@1"}]), "training.opponents[0].share: missing, but required"),
+    (training(checkpoint_every="soon"), "training.checkpoint_every: expected an integer or 'auto', got 'soon'"),
+    (training(checkpoint_every=0), "training.checkpoint_every: input should be greater than or equal to 1, got 0"),
     (training(per_policy={"a": {"gama": 1}}), "training.per_policy.a.gama: unknown key, did you mean 'gamma'?"),
     (training(lr={"initia": 1, "final": 0}), "training.lr.initia: unknown key, did you mean 'initial'?"),
     ({"gate": {"anchors": "script:random"}}, "gate.anchors: expected a list, got 'script:random'"),

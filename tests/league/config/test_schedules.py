@@ -119,7 +119,10 @@ def test_a_fault_of_a_schedule_is_reported_with_its_key(subtests: pytest.Subtest
         ({"lr": 0}, "training.lr: input should be greater than 0, got 0"),
         ({"lr": {"initial": 1}}, "training.lr.final: missing, but required"),
         ({"lr": {"initial": 1, "finall": 0}}, "training.lr.finall: unknown key, did you mean 'final'?"),
-        ({"entropy": {"schedule": "cosin", "initial": 1, "final": 0}}, "training.entropy.schedule: input should be"),
+        (
+            {"entropy": {"schedule": "cosin", "initial": 1, "final": 0}},
+            "training.entropy.schedule: expected 'linear' or 'cosine', got 'cosin'",
+        ),
         ({"entropy": {"initial": -1, "final": 0}}, "training.entropy.initial: input should be greater than or equal"),
         ({"clip": []}, f"{pairs}[]"),
         ({"clip": [[10, 1], [10, 2]]}, f"{pairs}[[10,"),
