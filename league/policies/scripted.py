@@ -16,9 +16,8 @@ from league.errors import EnvironmentMismatch, UnknownPolicy
 from league.policies.actions import check_legal_action, to_environment
 from league.policies.bots import Bot
 from league.policies.draws import Generators, UniformNumbers, choose, draw, elements
-from league.policies.line_games.game import OnePly
 from league.policies.line_games.mcts import MCTS
-from league.policies.line_games.minimax import Minimax
+from league.policies.line_games.minimax import Minimax, OnePly
 from league.policies.line_games.solver import Solver
 from league.policies.policy import Actions, Arrays, Policy
 from league.spaces import (

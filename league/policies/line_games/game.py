@@ -1,11 +1,7 @@
-"""Connect four and tic-tac-toe as line games, and the script `one_ply`, which plays both.
-
-`one_ply` wins immediately if possible, else prevents the opponent's immediate win, else plays like `random`.
-"""
+"""Connect four and tic-tac-toe as line games, and the base of the scripts that play both."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,19 +30,6 @@ class LineGame:
     def actions(self) -> int:
         return self.columns if self.gravity else self.rows * self.columns
 
-    def lines(self) -> NDArray:
-        """Return the squares of each line as 0 and 1, (lines, rows · columns) float32."""
-        covered = []
-        for row, column in product(range(self.rows), range(self.columns)):
-            for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-                last_row, last_column = row + down * (self.length - 1), column + right * (self.length - 1)
-                if last_row < self.rows and 0 <= last_column < self.columns:
-                    line = np.zeros((self.rows, self.columns), np.float32)
-                    for step in range(self.length):
-                        line[row + down * step, column + right * step] = 1
-                    covered.append(line.ravel())
-        return np.array(covered)
-
     def bits(self) -> NDArray[np.uint64]:
         """Return the bit of each square in a bitboard, (rows · columns,).
 
@@ -61,15 +44,6 @@ class LineGame:
     def steps(self) -> tuple[int, ...]:
         """Return the distances between neighbouring bits of a line: up, and the three directions to the right."""
         return 1, self.rows, self.rows + 1, self.rows + 2
-
-    def actions_on(self, squares: NDArray, empty: NDArray) -> NDArray:
-        """Return which actions take one of `squares`: two (k, rows · columns) bool → (k, actions) bool."""
-        if not self.gravity:
-            return squares & empty
-        empty = empty.reshape(-1, self.rows, self.columns)
-        lowest = empty.copy()
-        lowest[:, :-1] &= ~empty[:, 1:]
-        return (squares.reshape(empty.shape) & lowest).any(axis=1)
 
 
 CONNECT_FOUR = LineGame(rows=6, columns=7, length=4, gravity=True)
@@ -106,25 +80,3 @@ class BestMoves(ABC):
     @abstractmethod
     def best(self, boards: NDArray, legal: NDArray) -> NDArray:
         """Return the actions that it chooses from: (k, rows, columns, 2) and (k, actions) bool → (k, actions) bool."""
-
-
-class OnePly(BestMoves):
-    """Looks one move ahead in connect four and tic-tac-toe."""
-
-    def __init__(self, observation: Space, action: Space) -> None:
-        self._game = line_game("one_ply", observation, action)
-        self._lines = self._game.lines()
-
-    def best(self, boards: NDArray, legal: NDArray) -> NDArray:
-        planes = boards.reshape(len(boards), -1, 2).astype(np.float32)
-        empty = planes.sum(axis=2) == 0
-        best = legal
-        for player in (1, 0):
-            completing = legal & self._game.actions_on(self._completing(planes[:, :, player]), empty)
-            best = np.where(completing.any(axis=1, keepdims=True), completing, best)
-        return best
-
-    def _completing(self, own: NDArray) -> NDArray:
-        """Return the squares of all lines in which one square is missing in `own`, (k, squares)."""
-        almost = own @ self._lines.T == self._game.length - 1
-        return almost.astype(np.float32) @ self._lines > 0

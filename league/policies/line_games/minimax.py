@@ -1,4 +1,4 @@
-"""Depth-limited minimax search on batches of positions: the scripts `minimax_2` and `minimax_4`.
+"""Depth-limited minimax search on batches of positions: the scripts `one_ply`, `minimax_2` and `minimax_4`.
 
 All positions of a batch are searched at once with bitboards, so a teacher of this kind costs a fraction of training.
 """
@@ -23,7 +23,7 @@ class BatchedMinimax:
         squares = self._bits.reshape(game.rows, game.columns)
         self._board = np.bitwise_or.reduce(self._bits)
         self._lowest = np.bitwise_or.reduce(squares[-1])
-        self._reached = np.bitwise_or.reduce(squares, axis=0) if game.gravity else self._bits
+        self.reached = np.bitwise_or.reduce(squares, axis=0) if game.gravity else self._bits
 
     def positions(self, boards: NDArray) -> tuple[Bitboards, Bitboards]:
         """Return the bitboards of boards (k, rows, columns, 2), two (k,) uint64."""
@@ -45,9 +45,9 @@ class BatchedMinimax:
             opponent does (1, 3, …), 0 if neither, and LOST for an illegal move.
         """
         values = np.full((len(own), self._game.actions), LOST, np.int8)
-        winning, moves = self._completing(own), self._moves(own | other)
+        winning, moves = self.completing(own), self.moves(own | other)
         safe = self._safe(moves, other) & ~winning
-        for action, squares in enumerate(self._reached):
+        for action, squares in enumerate(self.reached):
             move = moves & squares
             values[move != 0, action] = 1 - plies
             values[(winning & move) != 0, action] = plies
@@ -59,13 +59,13 @@ class BatchedMinimax:
         """Return the values of positions, (k,), in which no move wins: `values` of the best moves; 0 without moves."""
         if plies < 2:
             return np.zeros(len(own), np.int8)
-        moves = self._moves(own | other)
+        moves = self.moves(own | other)
         safe = self._safe(moves, other)
         best = np.where((safe == 0) & (moves != 0), 1 - plies, 0).astype(np.int8)
         if plies == 2:
             return best
         best[safe != 0] = LOST
-        for squares in self._reached:
+        for squares in self.reached:
             move = safe & squares
             rows = np.flatnonzero(move)
             if len(rows):
@@ -73,13 +73,13 @@ class BatchedMinimax:
                 best[rows] = np.maximum(best[rows], replies)
         return best
 
-    def _moves(self, taken: Bitboards) -> Bitboards:
+    def moves(self, taken: Bitboards) -> Bitboards:
         """Return the squares that can be taken: the empty ones, with gravity the lowest empty one of each column."""
         return (taken + self._lowest) & self._board if self._game.gravity else self._board & ~taken
 
     def _safe(self, moves: Bitboards, opponents: Bitboards) -> Bitboards:
         """Return the moves after which the opponent cannot win at once."""
-        winning = self._completing(opponents) & self._board
+        winning = self.completing(opponents) & self._board
         threats = moves & winning
         # One threat must be prevented; of several, one remains.
         safe = np.where(threats == 0, moves, threats)
@@ -87,7 +87,7 @@ class BatchedMinimax:
         # With gravity, a move lets the opponent take the square above.
         return safe & ~(winning >> np.uint64(1)) if self._game.gravity else safe
 
-    def _completing(self, pieces: Bitboards) -> Bitboards:
+    def completing(self, pieces: Bitboards) -> Bitboards:
         """Return the squares that complete a line of `pieces`, occupied ones and ones outside the board included."""
         squares = np.zeros_like(pieces)
         everywhere = ~squares
@@ -101,6 +101,21 @@ class BatchedMinimax:
             for count in range(self._game.length):
                 squares |= above[count] & below[-1 - count]
         return squares
+
+
+class OnePly(BestMoves):
+    """Wins immediately if possible, else prevents the opponent's immediate win, else plays like `random`."""
+
+    def __init__(self, observation: Space, action: Space) -> None:
+        self._search = BatchedMinimax(line_game("one_ply", observation, action))
+
+    def best(self, boards: NDArray, legal: NDArray) -> NDArray:
+        own, other = self._search.positions(boards)
+        moves, best = self._search.moves(own | other), legal
+        for pieces in (other, own):
+            completing = (self._search.completing(pieces) & moves)[:, np.newaxis] & self._search.reached != 0
+            best = np.where((legal & completing).any(axis=1, keepdims=True), legal & completing, best)
+        return best
 
 
 class Minimax(BestMoves):

@@ -6,7 +6,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from league.policies.line_games.game import BestMoves, LineGame, OnePly, line_game
+from league.policies.line_games.game import BestMoves, LineGame, line_game
+from league.policies.line_games.minimax import OnePly
 from league.spaces import Space
 
 MAX_EMPTY = 18
