@@ -44,7 +44,7 @@ from evaluation.statistics.population import population
 from league.config.league import LeagueConfig
 from league.environments import building
 from league.errors import InvalidInput, LeagueError, WorkerLost, one_line
-from league.policies.loading import baselines, check_anchors, check_eligible, check_plays, eligible, pinned
+from league.policies.loading import baselines, check_contestants, check_eligible, check_plays, eligible, pinned
 from league.ray_cluster import (
     check_stack,
     check_stacks,
@@ -205,7 +205,7 @@ def evaluate(
         league = league.league
     row = registry.leagues.follow_code(league, building.interface)
     _check_options(schedule, against, budget)
-    check_anchors(row.config, registry)
+    check_contestants(row.config, None, registry)
     requested = [pinned(ref, league, registry) for ref in refs] or [
         version.ref for version in eligible(registry, league)
     ]

@@ -4,9 +4,8 @@ Only versions trained in the league's current environment take part in its match
 would be compared on a task that they were not trained for, even if the spaces are equal.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing
-from functools import partial
 
 from league.config.league import LeagueConfig
 from league.config.ppo import PPOConfig
@@ -30,7 +29,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import MAIN, SEARCH
 from league.registry.storage.rows import VersionRow
 
-ANCHORS = "gate.anchors"
+ANCHORS, OPPONENTS, TEACHER = "gate.anchors", "training.opponents", "training.teacher"
 BASELINES = ("script:random", "script:one_ply")
 
 
@@ -211,53 +210,45 @@ def _not_configured(ref: str, config: LeagueConfig, kind: str, known: list[str])
     )
 
 
-def check_contestants(config: LeagueConfig, interface: Interface, registry: Registry) -> None:
+def check_contestants(config: LeagueConfig, interface: Interface | None, registry: Registry) -> None:
     """Check the scripts, bots and remote models that a configuration names, and the versions among its anchors.
 
-    Versions among the opponents are checked when training resolves them.
+    Versions among the opponents are checked when training resolves them. interface: of the league; None to check
+    versions only.
 
     Raises:
         ConfigError: One does not exist, cannot be imported or reached, or cannot play in this league. Names its key.
     """
-    for error in _errors_of_contestants(config, partial(_check_script, interface=interface)):
-        raise error
-    check_anchors(config, registry)
+    for fault in faults_of_contestants(config, interface, lambda: registry, of_versions=(ANCHORS,)):
+        raise fault
 
 
-def check_anchors(config: LeagueConfig, registry: Registry) -> None:
-    """Check the versions among the anchors of a configuration.
+def faults_of_contestants(
+    config: LeagueConfig,
+    interface: Interface | None,
+    open_registry: Callable[[], Registry],
+    of_versions: Collection[str] = (ANCHORS, OPPONENTS, TEACHER),
+) -> Iterator[ConfigError]:
+    """Yield what is wrong with the contestants that a configuration names. See `check_contestants`.
 
-    Raises:
-        ConfigError: One does not exist, or cannot play in this league.
+    The registry is opened if a version is named. of_versions: keys below which versions are checked, too.
     """
-
-    def check(key: str, ref: CheckpointRef | ScriptRef | RemoteRef) -> None:
-        if key == ANCHORS and isinstance(ref, CheckpointRef):
-            _check_version(ref, config, registry)
-
-    for error in _errors_of_contestants(config, check):
-        raise error
-
-
-def errors_of_contestants(
-    config: LeagueConfig, interface: Interface, open_registry: Callable[[], Registry]
-) -> list[ConfigError]:
-    """Return what is wrong with the scripts, bots, remote models and versions that a configuration names.
-
-    The registry is opened if a version is named.
-    """
-
-    def check(key: str, ref: CheckpointRef | ScriptRef | RemoteRef) -> None:
-        _check_script(key, ref, interface)
-        if isinstance(ref, CheckpointRef):
-            _check_version(ref, config, open_registry())
-
-    return list(_errors_of_contestants(config, check))
-
-
-def _check_script(_: str, ref: CheckpointRef | ScriptRef | RemoteRef, interface: Interface) -> None:
-    if not isinstance(ref, CheckpointRef):
-        check_plays(ref, interface)
+    named = [(ANCHORS, anchor.ref) for anchor in config.gate.anchors]
+    named += [(OPPONENTS, opponent.ref) for opponent in config.training.opponents.fixed]
+    if isinstance(config.training, PPOConfig) and config.training.teacher is not None:
+        named.append((TEACHER, config.training.teacher.ref))
+    for key, ref in named:
+        try:
+            parsed = parse_ref(of_league(ref, config.league))
+            if not isinstance(parsed, CheckpointRef):
+                if interface is not None:
+                    check_plays(parsed, interface)
+            elif key in of_versions:
+                _check_version(parsed, config, open_registry())
+        except LeagueError as error:
+            fault = ConfigError(f"{key}: {error}")
+            fault.__cause__ = error
+            yield fault
 
 
 def _check_version(ref: CheckpointRef, config: LeagueConfig, registry: Registry) -> None:
@@ -277,23 +268,6 @@ def _check_version(ref: CheckpointRef, config: LeagueConfig, registry: Registry)
             return
         raise UnknownVersion(f"league {config.league} has no version yet: train it first") from error
     check_eligible(str(ref), registry, config)
-
-
-def _errors_of_contestants(
-    config: LeagueConfig, check: Callable[[str, CheckpointRef | ScriptRef | RemoteRef], None]
-) -> Iterator[ConfigError]:
-    """Call `check` with the key of each reference that a configuration names, and the reference; yield its errors."""
-    named = [(ANCHORS, anchor.ref) for anchor in config.gate.anchors]
-    named += [("training.opponents", opponent.ref) for opponent in config.training.opponents.fixed]
-    if isinstance(config.training, PPOConfig) and config.training.teacher is not None:
-        named.append(("training.teacher", config.training.teacher.ref))
-    for key, ref in named:
-        try:
-            check(key, parse_ref(of_league(ref, config.league)))
-        except LeagueError as error:
-            wrapped = ConfigError(f"{key}: {error}")
-            wrapped.__cause__ = error
-            yield wrapped
 
 
 def configured_contestants(config: LeagueConfig) -> list[str]:

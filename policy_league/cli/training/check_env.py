@@ -33,13 +33,13 @@ def check_env(
     """
     from league.config.league import LeagueConfig
     from league.environments.conformance.examination import examine
-    from league.policies.loading import errors_of_contestants
+    from league.policies.loading import faults_of_contestants
 
     league = LeagueConfig.load(find(config))
     with progress(f"checking {league.environment.entry_point}") as show:
         examination = examine(league, episodes, steps, seed, seconds=seconds, progress=show)
     if examination.interface is not None:
-        for error in errors_of_contestants(league, examination.interface, open_registry):
+        for error in faults_of_contestants(league, examination.interface, open_registry):
             examination.add("fault", str(error))
     if as_json:
         document = asdict(replace(examination, interface=None))

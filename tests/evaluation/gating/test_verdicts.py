@@ -25,7 +25,7 @@ from evaluation.schedules.builders import paired_test, verdict
 from league.config.league import LeagueConfig
 from league.config.play import PlayConfig
 from league.errors import ConfigError, InvalidInput, UnknownPolicy, VerdictRefuted
-from league.policies.loading import check_anchors
+from league.policies.loading import check_contestants
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
 from league.registry.storage import tables
@@ -73,7 +73,7 @@ def refs(registry: Registry, candidate: int, champion: str, **gate: object) -> l
 
 def test_configured_anchors_precede_earlier_champions(registry: Registry) -> None:
     """A candidate is not its own anchor, nor is the champion; aliases are pinned, and missing ones left out."""
-    check_anchors(config(anchors=["@champion"]), registry)
+    check_contestants(config(anchors=["@champion"]), None, registry)
     promote(registry, 1, 2)
     registry.aliases.set(LEAGUE, "gold", 3, expected=None, actor="me", reason="test")
     aliases = ["@gold", "@silver", "@4", "tictactoe@2", "@champion"]
@@ -112,7 +112,7 @@ def test_anchors_are_checked_before_anything_is_played(registry: Registry, subte
         nightly(config(anchors=["script:no_bots:act"]), registry=registry)
     environment = {"entry_point": "pettingzoo.classic.connect_four_v3"}
     with pytest.raises(ConfigError, match=r"gate\.anchors: tictactoe@1 was trained in another environment"):
-        check_anchors(tictactoe.config(environment=environment, gate={"anchors": ["@1"]}), registry)
+        check_contestants(tictactoe.config(environment=environment, gate={"anchors": ["@1"]}), None, registry)
     assert (Ledger(registry).schedules(LEAGUE), registry.verdicts.all(LEAGUE)) == ([], [])
 
 
