@@ -26,7 +26,7 @@ import typer
 from benchmarks.harness import ROOT, Quick, Target
 from league.config.league import LeagueConfig
 from league.registry.registry import Registry
-from policy_league.cli.evaluation.nightly import run_nightly
+from policy_league.cli.evaluation.nightly import run_night
 from tests.support.leagues import tictactoe
 from tests.support.leagues.judged_league import MIDDLING, STRONG, STRONGEST, league_of
 
@@ -126,7 +126,7 @@ def traced(config: LeagueConfig) -> Trace:
 
     sys.setprofile(until_confirmation)
     try:
-        run_nightly(config, workers=0)
+        run_night(config, workers=0)
     finally:
         sys.setprofile(None)
     return trace

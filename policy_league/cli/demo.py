@@ -40,7 +40,7 @@ def demo(
     The results are stored in LEAGUE_HOME and can be used with all other commands.
     """
     from league.config.league import LeagueConfig
-    from policy_league.cli.evaluation.nightly import run_nightly
+    from policy_league.cli.evaluation.nightly import run_night
     from serve_app.runtime.launch import running
 
     storage = Storage.from_environment()
@@ -51,7 +51,7 @@ def demo(
     _train(config, minutes)
     _step(2, "Evaluate: each new version plays the champion in pairs of games with sides swapped.")
     say("A sequential test (GSPRT) decides when to stop: promote, reject or undecided.")
-    run_nightly(config, workers=0)
+    run_night(config, workers=0)
     _step(3, f"Serve: Ray Serve and HAProxy serve the champion on 127.0.0.1:{port}.")
     with running(storage, port=port, grpc_port=grpc_port) as url:
         _play(config, url)

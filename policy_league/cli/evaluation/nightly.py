@@ -147,35 +147,54 @@ def _run(
     from league.ray_cluster import ray_session
 
     with ray_session(address):
-        if train:
-            night, report = run_training_night(config, workers, quiet)
-            outcome.nights.append(night)
-            outcome.faults += [f"{config.league}: {fault}" for fault in faults_of(night)]
-        else:
-            report = run_nightly(config, workers, quiet)
+        night, report = run_night(config, workers, quiet, train=train)
+    if night is not None:
+        outcome.nights.append(night)
+        outcome.faults += [f"{config.league}: {fault}" for fault in faults_of(night)]
     if report is not None:
         outcome.reports.append(report)
         outcome.faults += [f"{config.league}: {fault}" for fault in report.faults]
 
 
-def run_nightly(config: "LeagueConfig", workers: int | None = CORES, quiet: bool = False) -> "NightlyReport":
-    """Run one league's nightly run, print the results, and write the league's report to LEAGUE_HOME/reports."""
+def run_night(
+    config: "LeagueConfig", workers: int | None = CORES, quiet: bool = False, *, train: bool = False
+) -> "tuple[TrainingNightRow | None, NightlyReport | None]":
+    """Run one league's nightly run, print the results, and write the league's report to LEAGUE_HOME/reports.
+
+    Returns:
+        The night of training, with `train`; and the report of the gate, unless an earlier process completed it.
+    """
     from evaluation.gating.nightly import nightly as run
+    from evaluation.gating.training_night import training_night
     from league.ray_cluster import connected
 
     storage = Storage.from_environment()
     storage.export()
-    registry, games = open_registry(), GameProgress(quiet)
+    registry, games, night = open_registry(), GameProgress(quiet), None
+    if (trainer := _trainer(registry, games, quiet)) is None and train:
+        raise ConfigError(
+            "--train requires PyTorch, which is not installed: use the trainer image, or pip install policy-league"
+        )
+    report: NightlyReport | None
     with ExitStack() as stack:
-        if config.gate.exploiters.count:
+        if train or config.gate.exploiters.count:
             stack.enter_context(exit_on_interrupt())
             stack.enter_context(connected(None, storage))
         listener = stack.enter_context(games)
-        report = run(
-            config, registry=registry, train=_trainer(registry, games, quiet), workers=workers, listener=listener
-        )
-    _show(report, registry, config, quiet)
-    return report
+        if train and trainer is not None:
+            announce = (lambda _: None) if quiet else say
+            night, report = training_night(
+                config, registry=registry, train=trainer, workers=workers, listener=listener, announce=announce
+            )
+        else:
+            report = run(config, registry=registry, train=trainer, workers=workers, listener=listener)
+    for fault in () if night is None else faults_of(night):
+        complain(f"{config.league}: {fault}")
+    if report is not None:
+        _show(report, registry, config, quiet)
+    for sentence in () if night is None or quiet else summary_of_night(night):
+        say(sentence)
+    return night, report
 
 
 def _show(report: "NightlyReport", registry: "Registry", config: "LeagueConfig", quiet: bool) -> None:
@@ -199,43 +218,6 @@ def _show(report: "NightlyReport", registry: "Registry", config: "LeagueConfig",
         say()
         show_leaderboard(report.leaderboard, why_not_champion(registry, config.league, report.leaderboard))
         say(f"\nReport: {page}")
-
-
-def run_training_night(
-    config: "LeagueConfig", workers: int | None = CORES, quiet: bool = False
-) -> "tuple[TrainingNightRow, NightlyReport | None]":
-    """Run one league's night of training, print the results, and write the league's report.
-
-    Returns:
-        The night, and the report of the gate unless an earlier process completed it.
-    """
-    from evaluation.gating.training_night import training_night
-    from league.ray_cluster import connected
-
-    storage = Storage.from_environment()
-    storage.export()
-    registry, games = open_registry(), GameProgress(quiet)
-    if (train := _trainer(registry, games, quiet)) is None:
-        raise ConfigError(
-            "--train requires PyTorch, which is not installed: use the trainer image, or pip install policy-league"
-        )
-    with exit_on_interrupt(), connected(None, storage), games as listener:
-        night, report = training_night(
-            config,
-            registry=registry,
-            train=train,
-            workers=workers,
-            listener=listener,
-            announce=(lambda _: None) if quiet else say,
-        )
-    for fault in faults_of(night):
-        complain(f"{config.league}: {fault}")
-    if report is not None:
-        _show(report, registry, config, quiet)
-    if not quiet:
-        for sentence in summary_of_night(night):
-            say(sentence)
-    return night, report
 
 
 def _trainer(registry: "Registry", games: GameProgress, quiet: bool) -> "Trainer | None":
