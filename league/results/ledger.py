@@ -3,8 +3,7 @@
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from itertools import chain, groupby
-from operator import attrgetter
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -85,10 +84,6 @@ class Ledger:
                 .values(purged_at=datetime.now(UTC))
             )
 
-    def append(self, match: Match) -> bool:
-        """Store a match; False if it exists. Raises LedgerConflict if it contradicts its schedule."""
-        return self.extend([match]) == 1
-
     def extend(self, matches: Sequence[Match]) -> int:
         """Store matches, all or none; returns the number of new ones.
 
@@ -130,20 +125,8 @@ class Ledger:
     def matches(self, *, league: str, schedule: str | None = None) -> list[Match]:
         """Return the matches of a league, or of one of its schedules, in schedule order."""
         with self._database.read() as session:
-            schedules = {
-                league_schedule.id: league_schedule for league_schedule in _schedules(session, league, schedule)
-            }
-            match = tables.MatchTable
-            query = (
-                select(match.schedule, match.position, match.moves)
-                .join(tables.ScheduleTable, tables.ScheduleTable.id == match.schedule)
-                .where(tables.ScheduleTable.league == league)
-                .order_by(tables.ScheduleTable.sequence, match.position)
-            )
-            if schedule is not None:
-                query = query.where(match.schedule == schedule)
-            groups = groupby(session.execute(query), key=attrgetter("schedule"))
-            return [match for name, rows in groups for match in _matches(schedules[name], list(rows))]
+            schedules = _schedules(session, league, schedule)
+        return [match for league_schedule in schedules for match in self.walk(league_schedule)]
 
     def walk(self, schedule: Schedule) -> Iterator[Match]:
         """Iterate over the matches of a schedule in order, with at most STRIDE of them in memory."""

@@ -145,7 +145,7 @@ def test_settings_curves_speed_and_games_of_two_runs_are_compared(with_runs: Reg
     ledger = Ledger(with_runs)
     ledger.open(schedule)
     for position in (0, 1):
-        ledger.append(play_match(schedule, position))
+        ledger.extend([play_match(schedule, position)])
     between = compare_runs(with_runs, f"{LEAGUE}/{FIRST}", SECOND).between
     assert (between.first, between.second) == (f"{LEAGUE}@1", f"{LEAGUE}@2")
     assert (between.score, between.games) == (0.25, 4), "contestant 0 of the schedule wins one game and draws one"

@@ -43,7 +43,7 @@ def test_a_change_of_the_game_is_reported_once_it_concerns_results(
         registry.leagues.register(with_play(**play), interface())
     ledger = Ledger(registry)
     ledger.open(SCHEDULE)
-    ledger.append(play_match(SCHEDULE, 0))
+    ledger.extend([play_match(SCHEDULE, 0)])
     for play in ({}, {"actions": "greedy"}):  # the default
         registry.leagues.register(with_play(**play), interface())
     assert caplog.messages == []
@@ -118,7 +118,7 @@ def test_results_count_again_when_the_game_is_back(registry: Registry, caplog: p
     """The message says so, unless there are none, or the selection of actions is another one."""
     ledger = Ledger(registry)
     ledger.open(SCHEDULE)
-    ledger.append(play_match(SCHEDULE, 0))
+    ledger.extend([play_match(SCHEDULE, 0)])
     registry.leagues.register(config(revision="2"), interface())
     registry.leagues.register(config(), interface())
     changed, back = caplog.messages

@@ -35,7 +35,7 @@ def test_a_snapshot_is_stored_with_its_mark(registry: Registry) -> None:
 
 
 CHANGES: dict[str, Callable[[Registry], object]] = {
-    "a match": lambda registry: Ledger(registry).append(play_match(SCHEDULE, 1)),
+    "a match": lambda registry: Ledger(registry).extend([play_match(SCHEDULE, 1)]),
     "a purge": lambda registry: Ledger(registry).purge([SCHEDULE.id]),
     "a version": lambda registry: publish(registry, "run/1"),
     "a promotion": lambda registry: registry.aliases.set(
@@ -55,7 +55,7 @@ def test_the_mark_of_a_league_changes_with_its_data(registry: Registry) -> None:
     publish(registry, "run/0")
     ledger = Ledger(registry)
     ledger.open(SCHEDULE)
-    ledger.append(play_match(SCHEDULE, 0))
+    ledger.extend([play_match(SCHEDULE, 0)])
     registry.verdicts.open(LEAGUE, 1, "script:random", SCHEDULE.id, {})
     registered(registry, "chess", versions=1)
     marks = [registry.snapshots.current_marks()]

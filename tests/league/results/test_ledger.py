@@ -50,13 +50,13 @@ def test_the_size_of_a_schedule_is_limited(ledger: Ledger, storage: Storage, mon
     monkeypatch.setattr(ledger_module, "MOST_BYTES", 3 * size + size // 2)
     ledger.extend([play_match(SCHEDULE, position) for position in range(2)])
     again = Ledger(Registry.open(storage))  # after a restart
-    assert again.append(play_match(SCHEDULE, 2))
+    assert again.extend([play_match(SCHEDULE, 2)])
     with pytest.raises(OutOfSpace, match="recorded games of schedule"):
-        again.append(play_match(SCHEDULE, 3))
+        again.extend([play_match(SCHEDULE, 3)])
     assert ledger.positions(SCHEDULE.id) == {0, 1, 2}
     other = replace(SCHEDULE, id="of another evaluation")
     ledger.open(other)
-    assert ledger.append(play_match(other, 0))
+    assert ledger.extend([play_match(other, 0)])
 
 
 def test_games_leave_space_on_the_disk_of_the_database(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_games_leave_space_on_the_disk_of_the_database(tmp_path: Path) -> None:
         ledger = Ledger(registry)
         ledger.open(SCHEDULE)
         with pytest.raises(OutOfSpace, match=r"[01] MB are free on the disk of .*: games are recorded only"):
-            ledger.append(play_match(SCHEDULE, 0))
+            ledger.extend([play_match(SCHEDULE, 0)])
         registry.keys.create("other-changes-go-on", ["act"])
         registry.close()
 
@@ -91,7 +91,7 @@ def test_a_block_with_a_forfeit_has_scores_but_no_returns(ledger: Ledger) -> Non
     first, second = play_match(SCHEDULE, 0).games
     lost = replace(first, scores=(0.0, 1.0), forfeits=(Forfeit(0, "player_1", "illegal_action"),))
     match = SCHEDULE.match(0, (lost, second))
-    ledger.append(match)
+    ledger.extend([match])
     assert ledger.matches(league=LEAGUE) == [match]
     sums = ledger.sums(LEAGUE, [SCHEDULE])["tictactoe@1", "tictactoe@2"].whole
     assert (sums.points, sums.played, sums.complete) == ((0.5, 1.5), 2, 0)
@@ -113,7 +113,7 @@ def test_matches_are_listed_newest_first(ledger: Ledger) -> None:
         ledger.open(schedule)
     order = [(other, 4), (SCHEDULE, 0), (other, 1), (SCHEDULE, 7), (SCHEDULE, 2)]
     for schedule, position in order:
-        ledger.append(play_match(schedule, position))
+        ledger.extend([play_match(schedule, position)])
     expected = [entry(*listed) for listed in reversed(order)]
     page = ledger.page(LEAGUE, limit=2)
     assert summarized(page) == expected[:2]
@@ -148,7 +148,7 @@ def test_a_contestant_that_plays_with_itself_is_listed_once(ledger: Ledger) -> N
     ledger.open(schedule)
     for position in range(3):
         games = tuple(replace(game(schedule, position, i), scores=(None, None)) for i in range(2))
-        ledger.append(schedule.match(position, games))
+        ledger.extend([schedule.match(position, games)])
     (entry_of_match,) = ledger.page(LEAGUE, contestants=("tictactoe@2", "tictactoe@2"))
     assert (entry_of_match.id, entry_of_match.result.contestants) == ("team/2", ("tictactoe@2", "tictactoe@2"))
 
@@ -165,7 +165,7 @@ def test_a_schedule_is_read_in_strides(ledger: Ledger, monkeypatch: pytest.Monke
 
 def test_a_match_is_found_without_its_moves(ledger: Ledger) -> None:
     ledger.open(SCHEDULE)
-    ledger.append(play_match(SCHEDULE, 1))
+    ledger.extend([play_match(SCHEDULE, 1)])
     assert ledger.page(LEAGUE) == [ledger.entry(SCHEDULE.match_id(1))]
     for name in (SCHEDULE.match_id(2), "nothing/1", "nothing", f"{SCHEDULE.id}/{10**30}", f"{SCHEDULE.id}/-1"):
         with pytest.raises(NotFound):
@@ -230,11 +230,11 @@ REJECTED: list[tuple[Callable[[Match], Match], str]] = [
 
 def test_a_match_that_contradicts_its_schedule_is_rejected(ledger: Ledger, subtests: pytest.Subtests) -> None:
     with pytest.raises(NotFound, match="there is no schedule 'tictactoe-round_robin-1'"):
-        ledger.append(play_match(SCHEDULE, 0))
+        ledger.extend([play_match(SCHEDULE, 0)])
     ledger.open(SCHEDULE)
     for number, (change, message) in enumerate(REJECTED):
         with subtests.test(number=number, message=message), pytest.raises(LedgerConflict, match=message):
-            ledger.append(change(play_match(SCHEDULE, 1)))
+            ledger.extend([change(play_match(SCHEDULE, 1))])
     assert ledger.matches(league=LEAGUE) == []
 
 
@@ -300,10 +300,10 @@ def test_matches_are_stored_once_and_returned_exactly_in_schedule_order(ledger: 
     ledger.open(second)
     assert ledger.schedules(LEAGUE) == [SCHEDULE, second]
     for position in (4, 0, 2):
-        assert ledger.append(play_match(SCHEDULE, position)) is True
+        assert ledger.extend([play_match(SCHEDULE, position)]) == 1
     match = play_match(SCHEDULE, 4)
     other_moves = replace(match, games=tuple(replace(game, actions=(8,)) for game in match.games))
-    assert (ledger.append(match), ledger.append(other_moves)) == (False, False)
+    assert (ledger.extend([match]), ledger.extend([other_moves])) == (0, 0)
     expected = [play_match(SCHEDULE, position) for position in (0, 2, 4)]
     assert ledger.matches(league=LEAGUE) == expected
     assert ledger.matches(league=LEAGUE, schedule=SCHEDULE.id) == expected
@@ -331,4 +331,4 @@ def test_a_block_of_solo_games_is_one_comparison(ledger: Ledger) -> None:
     match = solo_match(schedule, 2, 3.5, 2.0)
     both = replace(match.games[0], returns=(3.5, 2.0), scores=(1.0, 0.0))
     with pytest.raises(LedgerConflict, match="finite return of each contestant that played"):
-        ledger.append(replace(match, games=(both, match.games[1])))
+        ledger.extend([replace(match, games=(both, match.games[1]))])

@@ -68,11 +68,11 @@ def _matches(registry: Registry) -> None:
     for schedule in (current, purged):
         ledger.open(schedule)
     for position in range(5):
-        ledger.append(play_match(current, position))
+        ledger.extend([play_match(current, position)])
     last = play_match(current, 5)
     forfeit = Forfeit(contestant=1, agent="player_1", reason="illegal_action")
-    ledger.append(replace(last, games=(replace(last.games[0], forfeits=(forfeit,)), last.games[1])))
-    ledger.append(play_match(purged, 0))
+    ledger.extend([replace(last, games=(replace(last.games[0], forfeits=(forfeit,)), last.games[1]))])
+    ledger.extend([play_match(purged, 0)])
     ledger.purge([purged.id])
 
 

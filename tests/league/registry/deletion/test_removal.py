@@ -50,7 +50,7 @@ def used_league(storage: Storage) -> Registry:
     for name, opponent in ((VERDICT, 2), (ANCHOR, 1)):
         schedule = replace(SCHEDULE, id=name, league=LEAGUE, contestants=(f"{LEAGUE}@3", f"{LEAGUE}@{opponent}"))
         ledger.open(schedule)
-        ledger.append(play_match(schedule, 0))
+        ledger.extend([play_match(schedule, 0)])
     registry.verdicts.open(LEAGUE, 3, f"{LEAGUE}@2", VERDICT, SETTINGS)
     move(registry, 1, None, None)
     move(registry, 3, 1, VERDICT)
@@ -133,7 +133,7 @@ def test_matches_between_other_contestants_stay(used: Registry) -> None:
         assert play_match(round_robin, position).contestants == tuple(
             round_robin.contestants[index] for index in (one, other)
         )
-        ledger.append(play_match(round_robin, position))
+        ledger.extend([play_match(round_robin, position)])
     plan = used.removal.remove_version(CheckpointRef(LEAGUE, 3), force=True)
     assert plan.matches == 2 + 2, "those of the verdict, and those of the version in the round robin"
     assert [match.contestants for match in ledger.matches(league=LEAGUE)] == [(f"{LEAGUE}@1", "script:random")]
