@@ -5,7 +5,6 @@ searched as Python does. What the user's code imports is found in installed pack
 then in the working directory, so that a file in them cannot replace a library.
 """
 
-import difflib
 import importlib
 import os
 import sys
@@ -16,7 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from league.environment_code import environment_code, module_in
-from league.errors import OWN_PACKAGES, ConfigError, no_exit, raised_at
+from league.errors import OWN_PACKAGES, ConfigError, did_you_mean, no_exit, raised_at
 
 _folders: list[str] = []
 
@@ -83,9 +82,8 @@ def import_entry_point(key: str, entry_point: str, folder: str | None = None) ->
 
 def missing(module: ModuleType, name: str) -> str:
     """`'game' (/home/ann/game.py) has no 'make_en', did you mean 'make_env'?`"""
-    close = difflib.get_close_matches(name, vars(module), n=1)
-    guess = "".join(f", did you mean {similar_name!r}?" for similar_name in close)
-    return f"{module.__name__!r} ({getattr(module, '__file__', 'built in')}) has no {name!r}{guess}"
+    place = getattr(module, "__file__", "built in")
+    return f"{module.__name__!r} ({place}) has no {name!r}{did_you_mean(name, vars(module))}"
 
 
 def _check_name(key: str, name: str, folders: Iterable[str]) -> None:

@@ -3,6 +3,7 @@
 import sysconfig
 import traceback
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -84,3 +85,8 @@ def to_document(error: LeagueError) -> dict[str, str]:
 def from_document(document: Mapping[str, Any]) -> LeagueError:
     """Return the error that `to_document` returned the data of."""
     return BY_CODE[document["code"]](document["message"])
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return `, did you mean 'steps'?`, or nothing if no known name is similar."""
+    return "".join(f", did you mean {similar!r}?" for similar in get_close_matches(name, list(known), n=1))

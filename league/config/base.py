@@ -1,13 +1,12 @@
 """Base of all sections of a configuration."""
 
 from collections.abc import Mapping
-from difflib import get_close_matches
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from league.errors import InvalidReference
+from league.errors import InvalidReference, did_you_mean
 from league.frozen import FrozenModel
 from league.refs import of_league, parse_ref
 
@@ -25,11 +24,9 @@ class Part(FrozenModel, allow_inf_nan=False):
         names = sorted(field.alias or name for name, field in cls.model_fields.items())
         faults, choices = [], f", expected one of {', '.join(names)}"
         for key in (str(key) for key in value if key not in names):
-            if guesses := get_close_matches(key, names, n=1):
-                message = f"unknown key, did you mean {guesses[0]!r}?"
-            else:
-                message, choices = f"unknown key{choices}", ""
-            fault = PydanticCustomError("unknown_key", "{message}", {"message": message})
+            if not (hint := did_you_mean(key, names)):
+                hint, choices = choices, ""
+            fault = PydanticCustomError("unknown_key", "unknown key{hint}", {"hint": hint})
             faults.append(InitErrorDetails(type=fault, loc=(key,), input=None))
         if faults:
             raise ValidationError.from_exception_data(cls.__name__, faults)

@@ -1,9 +1,9 @@
 """The section `environment.external`: a game that is no Python object but a simulator, which connects and plays."""
 
 import re
-from typing import Self
+from typing import Annotated
 
-from pydantic import Field, PositiveFloat, field_validator, model_validator
+from pydantic import Field, PositiveFloat, field_validator
 
 from league.config.base import Part
 from league.interface import AgentInterface
@@ -19,7 +19,9 @@ class ExternalConfig(Part):
     version: str
     """Version of the simulator, which it sends, too. It identifies the rules of the game: results of different versions
     are never combined. Change it with the rules."""
-    agents: dict[str, AgentInterface] = Field(min_length=1, max_length=1000)
+    agents: dict[Annotated[str, Field(min_length=1, max_length=64)], AgentInterface] = Field(
+        min_length=1, max_length=1000
+    )
     """Agent → its spaces, `observation` and `action`."""
     hidden_information: bool
     """Whether observations hide parts of the state from an opponent."""
@@ -36,9 +38,3 @@ class ExternalConfig(Part):
         if not NAME.fullmatch(value):
             raise ValueError("expected 1 to 64 letters, digits, spaces, `.`, `_`, `+` and `-`")
         return value
-
-    @model_validator(mode="after")
-    def _agents_have_names(self) -> Self:
-        if invalid := next((agent for agent in self.agents if not agent or len(agent) > 64), None):
-            raise ValueError(f"agents: the name {invalid[:80]!r} has {len(invalid)} characters, expected 1 to 64")
-        return self

@@ -15,18 +15,15 @@ from numpy.typing import NDArray
 
 from league.errors import ConfigError, IllegalMask
 from league.spaces import Box, Discrete, MultiDiscrete, Space
-from league.spaces.arrays import bounds
+from league.spaces.arrays import bounds, mask_size
 
 
 def dist_inputs_size(space: Space) -> int:
     """Return d, the number of distribution inputs. Raises ConfigError for an unsupported action space."""
-    match space:
-        case Discrete(n=n):
-            return n
-        case MultiDiscrete(nvec=nvec):
-            return int(np.sum(nvec))
-        case Box(dtype=dtype, shape=shape) if np.dtype(dtype).kind == "f":
-            return 2 * int(np.prod(shape))
+    if (size := mask_size(space)) is not None:
+        return size
+    if isinstance(space, Box) and np.dtype(space.dtype).kind == "f":
+        return 2 * int(np.prod(space.shape))
     raise ConfigError(f"unsupported action space {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
 
 

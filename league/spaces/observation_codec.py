@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import ObservationError
-from league.spaces import ACTION_MASK, Leaf, Space, inputs, paths
+from league.spaces import ACTION_MASK, Leaf, Space, leaf_paths, paths
 from league.spaces.arrays import at_path, check, check_mask
 from league.spaces.binary_leaves import check_decoded_size, decode, is_encoded
 
@@ -23,10 +23,8 @@ class ObservationReader:
     """Decodes observations of one space: leaves as nested lists or base64, in objects where the space is a Dict."""
 
     def __init__(self, space: Space) -> None:
+        self.leaves = leaf_paths(space)
         keys = paths(space)
-        self.leaves: tuple[tuple[str, tuple[str, ...], Leaf], ...] = tuple(
-            (name, keys[name], leaf) for name, leaf in inputs(space).items()
-        )
         self.is_masked = ACTION_MASK in keys
         self._objects = _objects(keys.values())
         self.keys = sum(len(names) for names in self._objects.values())

@@ -104,17 +104,8 @@ def _ask(ref: CheckpointRef, policy: str | None, value: Any, options: dict[str, 
         raise RemoteError(
             f"{error}; `league serve` starts a server, --url names another, --local needs none"
         ) from error
-    document = {
-        "action": np.asarray(response.action).tolist(),
-        "model": model,
-        "version": response.version,
-        "sha256": response.sha256,
-    }
-    if response.simulations is not None:
-        document["simulations"] = response.simulations
-    if response.analysis is not None:
-        document["analysis"] = asdict(response.analysis)
-    return document
+    action, analysis = np.asarray(response.action), None if response.analysis is None else asdict(response.analysis)
+    return _document(action, model, response.version, response.sha256, response.simulations, analysis)
 
 
 def _act_here(ref: CheckpointRef, policy: str | None, value: Any, options: dict[str, Any]) -> dict[str, Any]:
@@ -145,17 +136,19 @@ def _act_here(ref: CheckpointRef, policy: str | None, value: Any, options: dict[
     rng = [np.random.default_rng() if options["seed"] is None else generator(options["seed"], 0)]
     is_sampled = league.conditions.actions == "sampled" if options["explore"] is None else options["explore"]
     actions = player.act(observations, explore=is_sampled, rng=rng, **limits)
-    document = {
-        "action": actions.actions[0].tolist(),
-        "model": str(PolicyRef(ref.league, policy)),
-        "version": version.number,
-        "sha256": version.sha256,
-    }
+    simulations = analysis = None
     if isinstance(actions, SearchedActions):
-        document["simulations"] = actions.simulations()[0]
-        if options["analysis"]:
-            document["analysis"] = actions.analyses()[0]
-    return document
+        simulations, analysis = actions.simulations()[0], actions.analyses()[0] if options["analysis"] else None
+    model = str(PolicyRef(ref.league, policy))
+    return _document(actions.actions[0], model, version.number, version.sha256, simulations, analysis)
+
+
+def _document(
+    action: Any, model: str, version: int, sha256: str, simulations: int | None, analysis: Any
+) -> dict[str, Any]:
+    searched = {"simulations": simulations, "analysis": analysis}
+    document = {"action": action.tolist(), "model": model, "version": version, "sha256": sha256}
+    return document | {name: value for name, value in searched.items() if value is not None}
 
 
 def _read(observation: str) -> Any:
