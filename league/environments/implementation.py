@@ -46,7 +46,6 @@ VECTORISED = {
     "mpe2.simple_spread_v3": Verified(f"{VECTOR}.mpe.simple_spread:SimpleSpread", "parallel", MPE_PACKAGES),
     "mpe2.simple_adversary_v3": Verified(f"{VECTOR}.mpe.simple_adversary:SimpleAdversary", "parallel", MPE_PACKAGES),
     "mpe2.simple_tag_v3": Verified(f"{VECTOR}.mpe.simple_tag:SimpleTag", "parallel", MPE_PACKAGES),
-    "mpe2.simple_reference_v3": Verified(f"{VECTOR}.mpe.simple_reference:SimpleReference", "parallel", MPE_PACKAGES),
 }
 """Entry point of the stock environment → its vectorised environment."""
 

@@ -49,7 +49,7 @@ def integers(halves: NDArray[np.uint64], high: int) -> tuple[NDArray[np.int64], 
     """Return what `Generator.integers(high)` makes of 32-bit outputs.
 
     Args:
-        halves: Low, then high halves of 64-bit outputs, which PCG64 uses in this order.
+        halves: Low halves of 64-bit outputs, which PCG64 uses first.
         high: The integers are from 0 to high - 1; at least 2, since NumPy draws nothing for 1.
 
     Returns:

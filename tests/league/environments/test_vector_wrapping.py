@@ -20,7 +20,7 @@ from tests.support.environments.plans import Plan, assert_equal, plans
 from tests.support.environments.vector_copies import VectorCopies
 from tests.support.examples import examples
 
-SPREAD, TAG, REFERENCE = "mpe2.simple_spread_v3", "mpe2.simple_tag_v3", "mpe2.simple_reference_v3"
+SPREAD, TAG = "mpe2.simple_spread_v3", "mpe2.simple_tag_v3"
 
 
 PAD, INDICATOR = "pad_observations_v0", "agent_indicator_v0"
@@ -53,7 +53,6 @@ TWO_ADVERSARIES = partial(environment, TAG, num_adversaries=2, max_cycles=4)
 
 environments = st.one_of(
     same_spaces.map(partial(environment, SPREAD, N=2, max_cycles=4)),
-    same_spaces.map(partial(environment, REFERENCE, max_cycles=4)),
     st.lists(wrappers, max_size=3).map(TWO_ADVERSARIES),
     same_spaces.map(lambda others: TWO_ADVERSARIES([PAD, *others])),  # an indicator needs equal spaces
     st.lists(wrappers | st.sampled_from(["clip_actions_v0", {"scale_actions_v0": {"scale": 0.7}}]), max_size=4).map(

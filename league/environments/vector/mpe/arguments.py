@@ -23,9 +23,3 @@ def check_counts(least: int, **counts: Any) -> None:
     for name, value in counts.items():
         if not isinstance(value, int) or value < least:
             raise UnsupportedArguments(f"{name}={value!r}")
-
-
-def check_ratio(local_ratio: Any) -> None:
-    """Raise UnsupportedArguments unless this is a number from 0 to 1."""
-    if not isinstance(local_ratio, int | float) or not 0 <= local_ratio <= 1:
-        raise UnsupportedArguments(f"local_ratio={local_ratio!r}")

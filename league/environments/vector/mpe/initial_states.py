@@ -1,4 +1,4 @@
-"""Initial states that MPE2 draws: goals, then positions."""
+"""Initial states that MPE2 draws: a goal, then positions."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,26 +7,21 @@ from league.random import pcg64
 
 
 def goals_and_positions(
-    seeds: NDArray[np.int64], goals: int, landmarks: int, entities: int
+    seeds: NDArray[np.int64], landmarks: int, entities: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Draw at most two goals, each of them the index of a landmark, and positions in [-1, 1]².
-
-    Returns:
-        Goals (goals, m) and positions (entities, 2, m).
-    """
+    """Draw a goal, the index of a landmark, and positions in [-1, 1]²: (m,) and (entities, 2, m)."""
     if landmarks == 1:
         # NumPy draws nothing if there is no choice.
-        return np.zeros((goals, len(seeds)), dtype=np.int64), positions_only(seeds, entities)
+        return np.zeros(len(seeds), dtype=np.int64), positions_only(seeds, entities)
     outputs = pcg64.outputs(seeds, 1 + 2 * entities)
-    halves = np.stack([outputs[0], outputs[0] >> 32])[:goals]
-    goal_landmarks, accepted = pcg64.integers(halves, landmarks)
+    goals, accepted = pcg64.integers(outputs[0], landmarks)
     positions = pcg64.uniform(outputs[1:], -1.0, 1.0)
-    for i in np.flatnonzero(~accepted.all(axis=0)):
+    for i in np.flatnonzero(~accepted):
         # At most one seed in four billion: NumPy draws again.
         generator = np.random.default_rng(int(seeds[i]))
-        goal_landmarks[:, i] = [generator.integers(landmarks) for _ in range(goals)]
+        goals[i] = generator.integers(landmarks)
         positions[:, i] = generator.uniform(-1.0, 1.0, 2 * entities)
-    return goal_landmarks, positions.reshape(entities, 2, -1)
+    return goals, positions.reshape(entities, 2, -1)
 
 
 def positions_only(seeds: NDArray[np.int64], entities: int) -> NDArray[np.float64]:

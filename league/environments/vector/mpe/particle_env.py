@@ -58,8 +58,6 @@ class ParticleEnv(VectorEnv):
         # (agents, …, n) from here on.
         actions = np.moveaxis(actions.reshape(len(env_ids), self.world.num_agents, *actions.shape[1:]), 0, -1)
         self._physics.step(particles, self._controls(actions) * self._accelerations)
-        if self.world.num_symbols:
-            particles.messages[:] = self._messages(actions)
         particles.steps[:] += 1
         self._particles.update(env_ids, particles)
         return self._rows(env_ids, particles, self.rewards(particles), particles.steps >= self._max_cycles)
@@ -72,30 +70,20 @@ class ParticleEnv(VectorEnv):
         """See VectorEnv. The state consists of the observations of all agents."""
         return self._observations(self._particles.copies(env_ids), range(self.world.num_agents))
 
-    def goal_positions(self, particles: Particles) -> NDArray[np.float64]:
-        """Return the positions of the goals, (goals, 2, n)."""
-        return particles.positions[self.landmarks][particles.goals, :, np.arange(len(particles.steps))].swapaxes(1, 2)
-
-    def relative_positions(self, particles: Particles, agent: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def relative_positions(self, particles: Particles, agent: int) -> list[NDArray[np.float64]]:
         """Return the positions of landmarks and of other agents relative to an agent, (2 · entities, n) each."""
         positions = particles.positions
-        return relative(positions, agent, self.landmarks), relative(positions, agent, self.others[agent])
+        entities = positions[self.landmarks], positions[self.others[agent]]
+        return [(part - positions[agent]).reshape(2 * len(part), positions.shape[-1]) for part in entities]
 
     def _controls(self, actions: NDArray[Any]) -> NDArray[np.float64]:
         """Return horizontal and vertical controls in [-1, 1], (agents, 2, n)."""
         if not self._continuous:
-            moves = actions % 5
-            return np.stack([axis.take(moves) for axis in MOVES], axis=1)
+            return np.stack([axis.take(actions) for axis in MOVES], axis=1)
         # The league accepts actions that exceed the bounds by a rounding error.
         actions = np.clip(actions, 0, 1)
         # The sum, as in stock, turns -0.0 into 0.0.
-        return 0.0 + (actions[:, 2::2] - actions[:, 1::2])[:, :2].astype(np.float64)
-
-    def _messages(self, actions: NDArray[Any]) -> NDArray[Any]:
-        """Return what the agents say, (agents, symbols, n)."""
-        if not self._continuous:
-            return (actions // 5)[:, np.newaxis] == np.arange(self.world.num_symbols)[:, np.newaxis]
-        return 0.0 + np.clip(actions[:, 5:], 0, 1)
+        return 0.0 + (actions[:, 2::2] - actions[:, 1::2]).astype(np.float64)
 
     def _rows(
         self,
@@ -121,9 +109,3 @@ class ParticleEnv(VectorEnv):
         """Return the concatenated observations of some agents, (n, sizes)."""
         parts = [part for agent in agents for part in self.observation(particles, agent)]
         return np.ascontiguousarray(np.concatenate(parts, dtype=np.float32, casting="same_kind").T)
-
-
-def relative(positions: NDArray[np.float64], agent: int, entities: slice | NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the positions of entities relative to an agent, (2 · entities, n)."""
-    entity_positions = positions[entities]
-    return (entity_positions - positions[agent]).reshape(2 * len(entity_positions), positions.shape[-1])

@@ -27,7 +27,6 @@ class World:
         sizes: Radii of the entities that collide, which are the first ones.
         accelerations: Factor from a control in [-1, 1] to a force, for each agent.
         max_speeds: Speed limit of each agent; empty if there are none.
-        num_symbols: Size of a message.
     """
 
     num_agents: int
@@ -35,7 +34,6 @@ class World:
     sizes: Sequence[float]
     accelerations: Sequence[float]
     max_speeds: Sequence[float] = ()
-    num_symbols: int = 0
 
     @property
     def num_entities(self) -> int:
@@ -50,14 +48,12 @@ class Particles:
     Attributes:
         positions: (entities, 2, n) float64.
         velocities: (agents, 2, n) float64.
-        messages: What each agent says, (agents, symbols, n) float32.
-        goals: Indices of goal landmarks, (goals, n) int64.
+        goals: Index of the landmark that is the goal, (n,) int64; 0 in games without one.
         steps: Number of steps since the reset, (n,) int64.
     """
 
     positions: NDArray[np.float64]
     velocities: NDArray[np.float64]
-    messages: NDArray[np.float32]
     goals: NDArray[np.int64]
     steps: NDArray[np.int64]
 
@@ -75,17 +71,16 @@ class Particles:
             array[..., envs] = new
 
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.positions, self.velocities, self.messages, self.goals, self.steps
+        return self.positions, self.velocities, self.goals, self.steps
 
 
 def at_rest(world: World, positions: NDArray[np.float64], goals: NDArray[np.int64] | None = None) -> Particles:
-    """Return particles that neither move nor speak. goals: (goals, n)."""
+    """Return particles that do not move. goals: (n,), by default 0."""
     n = positions.shape[-1]
     return Particles(
         positions,
         velocities=np.zeros((world.num_agents, 2, n)),
-        messages=np.zeros((world.num_agents, world.num_symbols, n), dtype=np.float32),
-        goals=np.zeros((0, n), dtype=np.int64) if goals is None else goals,
+        goals=np.zeros(n, dtype=np.int64) if goals is None else goals,
         steps=np.zeros(n, dtype=np.int64),
     )
 

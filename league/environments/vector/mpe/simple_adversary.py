@@ -31,7 +31,7 @@ class SimpleAdversary(ParticleEnv):
 
     def draw(self, seeds: NDArray[np.int64]) -> Particles:
         """See ParticleEnv."""
-        goals, positions = goals_and_positions(seeds, 1, self.world.num_landmarks, self.world.num_entities)
+        goals, positions = goals_and_positions(seeds, self.world.num_landmarks, self.world.num_entities)
         return at_rest(self.world, positions, goals)
 
     def observation(self, particles: Particles, agent: int) -> Sequence[NDArray[Any]]:
@@ -39,11 +39,15 @@ class SimpleAdversary(ParticleEnv):
         entities = self.relative_positions(particles, agent)
         if agent == 0:
             return entities
-        return self.goal_positions(particles)[0] - particles.positions[agent], *entities
+        return self._goals(particles) - particles.positions[agent], *entities
 
     def rewards(self, particles: Particles) -> NDArray[np.float64]:
         """Reward the adversary for its own distance from the goal, and the agents for both sides' distances."""
         agents = particles.positions[: self.world.num_agents]
-        distances = lengths(agents - self.goal_positions(particles))
+        distances = lengths(agents - self._goals(particles))
         good = -distances[1:].min(axis=0) + distances[0]
         return np.stack([-distances[0], *[good] * (len(agents) - 1)])
+
+    def _goals(self, particles: Particles) -> NDArray[np.float64]:
+        """Return the positions of the goals, (2, n)."""
+        return particles.positions[self.landmarks][particles.goals, :, np.arange(len(particles.steps))].T

@@ -11,12 +11,12 @@ from league.environments.vector.mpe.arguments import (
     CURRICULUM,
     NEIGHBORS,
     check_counts,
-    check_ratio,
     reject_changed,
 )
 from league.environments.vector.mpe.initial_states import positions_only
 from league.environments.vector.mpe.particle_env import ParticleEnv
 from league.environments.vector.mpe.particles import Particles, World, at_rest, lengths
+from league.environments.vector.vector_env import UnsupportedArguments
 
 SIZE = 0.15
 
@@ -35,7 +35,8 @@ class SimpleSpread(ParticleEnv):
     ) -> None:
         reject_changed(others, COMMON | NEIGHBORS | CURRICULUM)
         check_counts(1, N=N)
-        check_ratio(local_ratio)
+        if not isinstance(local_ratio, int | float) or not 0 <= local_ratio <= 1:
+            raise UnsupportedArguments(f"local_ratio={local_ratio!r}")
         self._local_ratio = local_ratio
         self._pairs = [(a, b) for a in range(N) for b in range(a + 1, N)]
         world = World(num_agents=N, num_landmarks=N, sizes=[SIZE] * N, accelerations=[5.0] * N)
