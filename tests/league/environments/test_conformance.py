@@ -1,28 +1,38 @@
 """What `check-env` says of environments: faults, notes, and what it has measured."""
 
-import random
 import re
-import signal
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium import spaces
-from numpy.typing import NDArray
 
 from league.config.league import LeagueConfig
-from league.environments.conformance import episodes, examination, openings, time_budget
+from league.environments.conformance import episodes, time_budget
 from league.environments.conformance.examination import examine
 from league.environments.conformance.findings import Examination
 from league.environments.conformance.openings import OpeningLength, OpeningMeasurement, recommended
-from league.environments.vector.vector_env import AgentRows
 from policy_league.examples.kuhn_poker_vector import KuhnPokerVector
-from tests.support.environments.counting import Counting
 from tests.support.environments.simultaneous import Simultaneous
+from tests.support.environments.unsound import (
+    BrokenKuhnPoker,
+    ConstantImages,
+    DictActions,
+    Endless,
+    Forgetful,
+    IgnoresSeed,
+    OneRound,
+    OutOfBounds,
+    Shuffled,
+    Signalling,
+    Stateful,
+    Unrewarding,
+    WrongKuhnPoker,
+    WrongShape,
+)
+from tests.support.findings import shortened
 
 SUPPORT = "tests.support.environments"
 
@@ -42,12 +52,7 @@ CLASSIC, TWO_STEP = "pettingzoo.classic.", "policy_league.examples.two_step:"
 @pytest.fixture(autouse=True, scope="module")
 def short_examinations() -> Iterator[None]:
     """Few games, and short comparisons with stock environments."""
-    with pytest.MonkeyPatch.context() as patched:
-        for name, value in {"COMPARED_STEPS": 100, "COMPARED_COPIES": 4, "MEASURED_SECONDS": 0.01, "CYCLES": 5}.items():
-            patched.setattr(examination, name, value)
-        patched.setattr(episodes, "GAMES", 8)
-        patched.setattr(openings, "SEEDS", 8)
-        patched.setattr(openings, "OPENINGS", 100)
+    with shortened():
         yield
 
 
@@ -61,39 +66,6 @@ def findings(examination: Examination, severity: str) -> str:
     return "\n".join(str(finding) for finding in examination.findings if finding.severity == severity)
 
 
-class Forgetful(Simultaneous):
-    """Its first reset has other observations than the later ones."""
-
-    resets = 0
-
-    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
-        self.resets += 1
-        return super().reset(min(self.resets, 2), options)
-
-
-class WrongShape(Simultaneous):
-    def _observe(self, agent: str) -> np.ndarray:
-        return np.zeros(4, np.float32)
-
-
-class OutOfBounds(Simultaneous):
-    def observation_space(self, agent: str) -> spaces.Space:
-        return spaces.Box(0, 2, (3,), np.float32)
-
-
-class OneRound(Simultaneous):
-    """Nothing but the time and the seed 0 is observed. rounds: steps of a game."""
-
-    def __init__(self, rounds: int) -> None:
-        super().__init__(leaves=(rounds, rounds))
-
-    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
-        return super().reset(0, options)
-
-    def _observe(self, agent: str) -> np.ndarray:
-        return np.array([self.time, self.seed, 0], np.float32)
-
-
 def test_a_game_that_is_short_or_ends_early_gets_the_shortest_opening() -> None:
     lengths = [OpeningLength(0.1 * plies, 0.0 if plies <= 2 else 0.1) for plies in range(1, 9)]
     assert recommended(lengths, game=40) == 2, "longer ones end many games"
@@ -103,113 +75,14 @@ def test_a_game_that_is_short_or_ends_early_gets_the_shortest_opening() -> None:
     assert recommended([OpeningLength(0.005, 0.0)] * 8, game=40) == 0, "one position"
 
 
-class DictActions(Simultaneous):
-    def action_space(self, agent: str) -> spaces.Space:
-        return spaces.Dict(move=spaces.Discrete(2), talk=spaces.Discrete(2))
-
-
-class WrongKuhnPoker(KuhnPokerVector):
-    """Pays the loser."""
-
-    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
-        return [replace(rows, rewards=-rows.rewards) for rows in super().step(env_ids, actions)]
-
-
-class BrokenKuhnPoker(KuhnPokerVector):
-    """Raises at each step."""
-
-    def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
-        raise ZeroDivisionError("no cards")
-
-
 def league(entry_point: str | type, **kwargs: Any) -> LeagueConfig:
     if entry_point == CROSSING:
         return LeagueConfig.load("policy_league/configs/cars_and_lights.yaml")
-    name = entry_point if isinstance(entry_point, str) else f"{__name__}:{entry_point.__name__}"
+    name = entry_point if isinstance(entry_point, str) else f"{entry_point.__module__}:{entry_point.__name__}"
     policies = {"policies": {"a": ["*_0"], "b": ["*_1"]}} if name.startswith("tests") else {}
     return LeagueConfig.from_mapping(
         {"league": "x", "environment": {"entry_point": name, "kwargs": kwargs}, **policies}
     )
-
-
-class IgnoresSeed(Counting):
-    """Its reset ignores the seed: each episode differs from the previous one."""
-
-    played = 0
-
-    def reset(self, seed: int | None = None, options: dict | None = None) -> None:
-        IgnoresSeed.played += 1
-        super().reset(IgnoresSeed.played, options)
-
-
-class Shuffled(Simultaneous):
-    """It draws from a generator that all code shares. module: `random` or `numpy.random`."""
-
-    def __init__(self, module: str) -> None:
-        super().__init__()
-        self.draw = random.random if module == "random" else np.random.random
-
-    def _observe(self, agent: str) -> np.ndarray:
-        return np.full(3, self.draw(), np.float32)
-
-
-class Signalling(Simultaneous):
-    """Limits the time of its steps by signals, as decorators do."""
-
-    def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
-        signal.signal(signal.SIGALRM, signal.getsignal(signal.SIGALRM))
-        return super().step(actions)
-
-
-class Endless(Simultaneous):
-    """Its episodes do not end within 10,000 steps."""
-
-    def __init__(self) -> None:
-        super().__init__(leaves=(10**9, 10**9))
-
-
-class Unrewarding(Simultaneous):
-    """All rewards are 0. any_length: the seed decides the length of an episode."""
-
-    def __init__(self, truncated: Sequence[int] = (), any_length: bool = False) -> None:
-        super().__init__(truncated=truncated)
-        self.any_length = any_length
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        self.leaves = (2 + (seed or 0) % 3,) * 2 if self.any_length else self.leaves
-        return super().reset(seed, options)
-
-    def step(self, actions: dict[str, int]) -> tuple[dict, ...]:
-        observations, rewards, *flags = super().step(actions)
-        return observations, dict.fromkeys(rewards, 0.0), *flags
-
-
-class ConstantImages(Simultaneous):
-    """Its images never change."""
-
-    def __init__(self) -> None:
-        super().__init__(leaves=(30, 30))
-
-    def observation_space(self, agent: str) -> spaces.Space:
-        return spaces.Box(0, 255, (8, 8, 3), np.uint8)
-
-    def _observe(self, agent: str) -> np.ndarray:
-        return np.zeros((8, 8, 3), np.uint8)
-
-
-class Stateful(Counting):
-    """Its global state is sound, grows, is not finite, or raises."""
-
-    def __init__(self, kind: str) -> None:
-        super().__init__((3, 3))
-        self.kind, self.calls = kind, 0
-
-    def state(self) -> Any:
-        self.calls += 1
-        if self.kind == "raises":
-            raise RuntimeError("no camera")
-        states = {"grows": np.zeros(self.calls), "nan": np.full((2, 2), np.nan)}
-        return states.get(self.kind, np.zeros((2, 3), np.int8))
 
 
 def test_valid_environments_pass(subtests: pytest.Subtests) -> None:
@@ -251,7 +124,7 @@ FINDINGS: list[tuple[str, str | type, dict[str, Any], str]] = [
         "fault",
         Signalling,
         {},
-        r"^outside of the main thread, where training plays too, .* \(.*test_conformance.py, line \d+, step 1 of the"
+        r"^outside of the main thread, where training plays too, .* \(.*unsound.py, line \d+, step 1 of the"
         r" episode with seed 0\): ValueError: signal only works in main thread.* limit times by timeouts",
     ),
     ("fault", ConstantImages, {}, "observes a constant image"),
