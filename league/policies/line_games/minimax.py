@@ -110,9 +110,9 @@ class OnePly(BestMoves):
         self._search = BatchedMinimax(line_game("one_ply", observation, action))
 
     def best(self, boards: NDArray, legal: NDArray) -> NDArray:
-        own, other = self._search.positions(boards)
-        moves, best = self._search.moves(own | other), legal
-        for pieces in (other, own):
+        players = self._search.positions(boards)
+        moves, best = self._search.moves(players[0] | players[1]), legal
+        for pieces in reversed(players):
             completing = (self._search.completing(pieces) & moves)[:, np.newaxis] & self._search.reached != 0
             best = np.where((legal & completing).any(axis=1, keepdims=True), legal & completing, best)
         return best

@@ -314,7 +314,7 @@ def test_an_invalid_gate_is_rejected() -> None:
         ({"anchors": [{"ref": "script:random", "margin": 300}]}, "margins must lie within ±190"),
         ({"anchors": [{"ref": "script:random", "margins": 3}]}, "did you mean 'margin'"),
         ({"anchors": [{"ref": BOT, "mode": "no_worse", "margin": 50}]}, r"anchors\[0\]\.margin must be smaller than 1"),
-        ({"anchors": [{"ref": BOT, "mode": "best"}]}, "should be 'no_worse' or 'at_least', got 'best'"),
+        ({"anchors": [{"ref": BOT, "mode": "best"}]}, "expected 'no_worse' or 'at_least', got 'best'"),
         ({"margin": 0}, "gate.margin"),
         ({"model": "returns"}, "return_bound"),
         ({"model": "returns", "return_bound": 2}, "margin, which is a return with model: returns, must be smaller"),
