@@ -22,7 +22,7 @@ from benchmarks.harness import Parts, Quick, Target, chosen, in_rounds
 from benchmarks.training.learned import local_ray
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import Starts
 from league.environments.vector.connect_four import ConnectFour
 from league.environments.vector.vector_env import AgentRows

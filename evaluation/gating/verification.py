@@ -19,7 +19,7 @@ from evaluation.documents import Document
 from evaluation.gating.criteria.criterion import Contest
 from evaluation.gating.evidence import evidence, gate_result
 from evaluation.playback.replay import replay
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.errors import EnvironmentMismatch, InvalidInput, LedgerConflict, VerdictRefuted
 from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry

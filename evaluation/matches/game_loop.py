@@ -77,7 +77,7 @@ def play_matches(
     except Exception as error:
         if isinstance(error, LeagueError) or not len(environment.busy):
             raise
-        raise loop.crashed(int(environment.busy[0]), error) from error
+        raise loop.crashed(environment.busy, error) from error
     return loop.recorder.matches()
 
 
@@ -242,29 +242,27 @@ class _GameLoop:
         if self._plies and len(opened := playing[steps == self._plies]):
             self._environment.assign(opened, self._seating.after_opening[self._games[self._running[opened]]])
         if len(endless := playing[steps > self._max_moves]):
-            raise GameHung(f"{self._describe(int(endless[0]))} has not ended after {self._max_moves} moves")
+            raise GameHung(f"{self._describe(endless[:1])} has not ended after {self._max_moves} moves")
         if len(slow := playing[self._environment.seconds()[playing] > self._max_seconds]):
             raise self._hung(slow[:1])
 
-    def crashed(self, env: int, error: Exception) -> GameCrashed:
-        """The error for an environment that raised."""
+    def crashed(self, envs: Indices, error: Exception) -> GameCrashed:
+        """The error for environments of which one raised."""
         return GameCrashed(
-            f"{self._describe(env)} cannot continue: its environment raised {one_line(error, with_type=True)}"
+            f"{self._describe(envs)} cannot continue: its environment raised {one_line(error, with_type=True)}"
         )
 
     def _hung(self, envs: Indices) -> GameHung:
         """The error for games of which one hangs."""
-        peers = f", or one of {len(envs) - 1} others that are stepped with it," if len(envs) > 1 else ""
-        return GameHung(
-            f"{self._describe(int(envs[0]))}{peers} has not ended after {self._max_seconds:g} s of environment time"
-        )
+        return GameHung(f"{self._describe(envs)} has not ended after {self._max_seconds:g} s of environment time")
 
-    def _describe(self, env: int) -> str:
-        """`a game of duo@1 and duo@2 (game 0 of match duo-3f/17)` for the last game that an environment began."""
-        game = int(self._games[self._begun[env]])
+    def _describe(self, envs: Indices) -> str:
+        """`a game of duo@1 and duo@2 (game 0 of match duo-3f/17)` for the last games that environments began."""
+        game = int(self._games[self._begun[envs[0]]])
         position, index = int(self._plans.positions[game]), int(self._plans.indices[game])
         players = " and ".join(self._schedule.contestants_at(position))
-        return f"a game of {players} (game {index} of match {self._schedule.match_id(position)})"
+        peers = f", or one of {len(envs) - 1} others that are stepped with it," if len(envs) > 1 else ""
+        return f"a game of {players} (game {index} of match {self._schedule.match_id(position)}){peers}"
 
 
 def _leaf(space: Space) -> Leaf:

@@ -12,8 +12,8 @@ from evaluation.matches.seating import Roster
 from evaluation.matches.watchdog import Deadline, close_in_time
 from league.config.league import LeagueConfig
 from league.environments.building import interface
+from league.environments.copies import StockCopies
 from league.environments.implementation import STOCK_ENVS, VECTOR_ENVS, implementation, stepping
-from league.environments.lockstep import Lockstep
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch
 from league.policies.loading import check_eligible
@@ -94,7 +94,7 @@ class MatchWorker:
     def close_environment(self, expendable: bool = False) -> None:
         """Close the environment, and create another one for the next matches. expendable: see `play`."""
         # A vectorised one has nothing to close, and simulators stay connected.
-        if isinstance(self._environment, Lockstep):
+        if isinstance(getattr(self._environment, "copies", None), StockCopies):
             self._discard_environment(expendable)
 
     def _discard_environment(self, expendable: bool) -> None:

@@ -14,7 +14,7 @@ import orjson
 from evaluation.matches.seating import agent_sides
 from evaluation.playback.replay import replay, seated
 from evaluation.playback.single_game import GameStep
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.errors import ConfigError, NotFound
 from league.interface import AgentInterface, Interface
 from league.policies.loading import pinned

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from league.conditions import ActionSelection
 from league.config.league import LeagueConfig
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, Ending, Turn, each_agent_alone
 from league.errors import GameCrashed, UnknownPolicy, cause
 from league.interface import Interface

@@ -26,7 +26,7 @@ from evaluation.playback.environment_hooks import environment_hooks
 from evaluation.playback.replay import GameSource
 from league.config.environment import EnvironmentConfig
 from league.environments.building import build
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.errors import ConfigError, EnvironmentMismatch
 from league.files import disk_errors, replacing
 

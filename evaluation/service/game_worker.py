@@ -29,7 +29,7 @@ from evaluation.playback.human_play import human_play, playability
 from evaluation.playback.recorded_steps import recorded_steps
 from evaluation.playback.replay import GameSource, recorded_game
 from evaluation.playback.video import write_video
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, GameHung, LeagueError, one_line
 from league.policies.loading import acting_ref

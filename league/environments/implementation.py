@@ -8,10 +8,12 @@ from typing import Literal
 
 from league.config.environment import EnvironmentConfig
 from league.entry_points import import_entry_point
-from league.environments.lockstep import stock_stepping
+from league.environments.building import agent_interface, build
+from league.environments.copies import StockCopies, VectorCopies
+from league.environments.external.stepping import ExternalStepping
+from league.environments.lockstep import Lockstep
 from league.environments.stepping import BatchedEnvironment
 from league.environments.vector.vector_env import UnsupportedArguments, VectorEnv
-from league.environments.vector_stepping import VectorStepping
 from league.environments.vector_wrapping import UnsupportedWrapper, wrapped_vector
 from league.errors import ConfigError
 from league.registry.gateways import ForSimulators
@@ -126,7 +128,40 @@ def stepping(
     if vector is None:
         return stock_stepping(config, num_envs, crashes=crashes, states=states, simulators=simulators)
     make: Callable[[int], VectorEnv] = partial(vector, **config.kwargs)
-    return VectorStepping(config, make, num_envs, crashes, states, fast_seeds)
+    return Lockstep(VectorCopies(config, make, num_envs, fast_seeds), states)
+
+
+def stock_stepping(
+    config: EnvironmentConfig,
+    num_envs: int,
+    *,
+    crashes: int = 0,
+    render_mode: str | None = None,
+    states: bool = False,
+    of_seed: Callable[[int], EnvironmentConfig] | None = None,
+    simulators: ForSimulators | None = None,
+) -> BatchedEnvironment:
+    """Create copies of the stock environment that are stepped in lockstep, or by the simulators in which it runs.
+
+    Args:
+        config: The environment.
+        num_envs: Number of environments.
+        crashes: Number of consecutive exceptions after which an environment is recreated; the next one is raised.
+        render_mode: PettingZoo's render mode (`rgb_array`, `human`).
+        states: Include global states in the results.
+        of_seed: The environment of the episode with a seed, with the spaces of `config`: each episode has its own.
+        simulators: For what simulators may play. None: somebody watches, for whom they cannot.
+
+    Raises ConfigError if the environment cannot be created, and EnvironmentMismatch if only simulators play the game.
+    """
+    if config.external is not None:
+        env = build(config)
+        if simulators is None:
+            return env.reset()  # raises an error that says why
+        spaces = {agent: agent_interface(env, agent) for agent in env.possible_agents}
+        return ExternalStepping(config.external, spaces, num_envs, simulators)
+    make_of_seed = None if of_seed is None else lambda seed: build(of_seed(seed), render_mode)
+    return Lockstep(StockCopies(lambda: build(config, render_mode), num_envs, crashes, make_of_seed), states)
 
 
 def check_fast_seeds(config: EnvironmentConfig) -> None:

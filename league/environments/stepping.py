@@ -1,25 +1,22 @@
-"""Interface of batched environments, which step many environments per call; validation of actions; limit of crashes.
+"""Interface of batched environments, which step many environments per call; validation of actions.
 
 A step returns one batch per group with the observations of all agents that must act, across all environments. Groups
 are numbers that callers define: policies in training, policies of contestants in matches. In a turn-based game the rows
 of an agent are its own turns, and rewards are summed since the agent's previous row.
 """
 
-import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.vector.vector_env import AgentRows
-from league.errors import EnvironmentMismatch, IllegalAction, InvalidReward, one_line
-from league.spaces import ACTION_MASK, Box, Discrete, MultiBinary, MultiDiscrete, Space
+from league.errors import IllegalAction
+from league.spaces import ACTION_MASK, Box, DictSpace, Discrete, MultiBinary, MultiDiscrete, Space
 from league.spaces.arrays import bounds
-
-logger = logging.getLogger(__name__)
 
 Indices = NDArray[np.int64]
 
@@ -89,6 +86,11 @@ class Batch:
             self.rewards.take(rows),
         )
 
+    def part(self, rows: slice) -> "Batch":
+        """Return a batch of consecutive rows, which shares their memory."""
+        observations = {name: array[rows] for name, array in self.observations.items()}
+        return Batch(self.envs[rows], self.agents[rows], observations, self.rewards[rows])
+
 
 @dataclass(frozen=True, slots=True)
 class Ending:
@@ -156,21 +158,29 @@ class Turn:
                 yield Ending(env, agent, observation, float(rows.rewards[i]), *flags)
 
 
-class BatchedEnvironment(Protocol):
-    """n environments, stepped together. After the end of an episode, the next one starts in the same call."""
+class BatchedEnvironment(ABC):
+    """n environments, stepped together. After the end of an episode, the next one starts in the same call.
 
-    @property
-    def agents(self) -> tuple[str, ...]:
-        """Names of the agents, which rows and groups refer to by index."""
+    Attributes:
+        agents: Names of the agents, which rows and groups refer to by index.
+        num_envs: Number of environments.
+    """
 
-    @property
-    def num_envs(self) -> int:
-        """Number of environments."""
+    def __init__(self, agents: Sequence[str], num_envs: int) -> None:
+        self.agents: tuple[str, ...] = tuple(agents)
+        self.num_envs = num_envs
+        self._groups = np.zeros((num_envs, len(agents)), np.int64)
+        self._seeds, self._seconds = np.zeros(num_envs, np.int64), np.zeros(num_envs)
+        self._pending: dict[int, Batch] = {}
+        self._abandoned = no_envs()
+        self._next_episodes: NextEpisodes
 
+    @abstractmethod
     def start(self, next_episodes: NextEpisodes) -> Turn:
         """Reset all environments. `next_episodes` is called for all of them, and in each step after which some have
         no episode."""
 
+    @abstractmethod
     def step(self, actions: Mapping[int, NDArray]) -> Turn:
         """Step the environments of the last Turn. actions[group][i] belongs to row i of the group's batch in it.
 
@@ -185,17 +195,23 @@ class BatchedEnvironment(Protocol):
         The next `step` expects actions for the other rows only, and starts their next episodes. As after a crash, the
         aborted episodes have no endings and are not in `finished`.
         """
+        self._abandoned = np.union1d(self._abandoned, envs)
+        kept = {group: batch.rows(batch.without(envs)) for group, batch in self._pending.items()}
+        self._pending = {group: batch for group, batch in kept.items() if len(batch)}
 
     def assign(self, envs: Indices, groups: Indices) -> None:
         """Change the groups, (m, agents), of the agents of m environments, starting with the next Turn."""
+        self._groups[envs] = groups
 
     @property
+    @abstractmethod
     def busy(self) -> Indices:
         """The environments that are executing, for use in signal handlers, or the one that raised in the last call.
 
         Several execute together if a vectorised environment steps them; if it hangs, one of them does.
         """
 
+    @abstractmethod
     def seconds(self) -> NDArray[np.float64]:
         """Return the execution time of each environment in its current episode, including the reset, (n,) in seconds.
 
@@ -203,6 +219,7 @@ class BatchedEnvironment(Protocol):
         call in progress.
         """
 
+    @abstractmethod
     def render(self, env: int, agent: str | None = None) -> NDArray:
         """Render an environment, (height, width, 3) uint8.
 
@@ -210,65 +227,18 @@ class BatchedEnvironment(Protocol):
         Raises EnvironmentMismatch if it cannot be rendered.
         """
 
+    @abstractmethod
     def close(self) -> None:
         """Close the environments. An environment that hangs is the last one. What they raise is logged."""
 
-
-class EpisodeStepping:
-    """What the implementations of BatchedEnvironment have in common: groups, abandoned episodes, times and crashes.
-
-    Attributes:
-        agents: See BatchedEnvironment.
-        num_envs: See BatchedEnvironment.
-    """
-
-    def __init__(self, agents: Sequence[str], num_envs: int, crashes: int) -> None:
-        self.agents: tuple[str, ...] = tuple(agents)
-        self.num_envs = num_envs
-        self._groups = np.zeros((num_envs, len(agents)), np.int64)
-        self._crashes = CrashLimit(num_envs, crashes)
-        self._pending: dict[int, Batch] = {}
-        self._abandoned = no_envs()
-        self._seconds = np.zeros(num_envs)
-        self._since = 0.0
-        self._next_episodes: NextEpisodes
-
-    def abandon(self, envs: Indices) -> None:
-        """See BatchedEnvironment."""
-        self._abandoned = np.union1d(self._abandoned, envs)
-        kept = {group: batch.rows(batch.without(envs)) for group, batch in self._pending.items()}
-        self._pending = {group: batch for group, batch in kept.items() if len(batch)}
-
-    def assign(self, envs: Indices, groups: Indices) -> None:
-        """See BatchedEnvironment."""
-        self._groups[envs] = groups
-
-    def _starts(self, free: Indices) -> tuple[Indices, Indices]:
-        """Return the environments among `free` ones whose next episodes start, and the seeds of their resets."""
+    def _starts(self, free: Indices) -> Indices:
+        """Return the environments among `free` ones whose next episodes start."""
         starts = self._next_episodes(free)
         self._groups[starts.envs] = starts.groups
         self._seconds[starts.envs] = 0.0
         # Some environments store the seed as a signed 32-bit integer.
-        return starts.envs, starts.seeds % 2**31
-
-
-def picture(rendered: Any) -> NDArray[np.uint8]:
-    """Return what `render` has returned as an array. Raises EnvironmentMismatch if it is None."""
-    if rendered is None:
-        raise EnvironmentMismatch("the environment cannot be rendered: it does not support render_mode 'rgb_array'")
-    return np.asarray(rendered, dtype=np.uint8)
-
-
-def without_action(seed: int) -> EnvironmentMismatch:
-    """Return the error for an episode in which no agent must act."""
-    return EnvironmentMismatch(f"the episode with seed {seed} ends at its reset, without an action")
-
-
-def invalid_reward(agent: str, reward: float, seed: int) -> InvalidReward:
-    """Return the error for a reward that is not finite."""
-    return InvalidReward(
-        f"agent {agent} got a reward of {reward} in the episode with seed {seed}, expected a finite number"
-    )
+        self._seeds[starts.envs] = starts.seeds % 2**31
+        return starts.envs
 
 
 ROUNDING = 1e-5
@@ -280,7 +250,7 @@ def check_actions(batch: Batch, actions: NDArray, space: Space, agents: Sequence
     rows = len(batch)
     if len(actions) != rows:
         raise IllegalAction(f"{len(actions)} actions for {rows} agents")
-    if isinstance(space, Discrete | Box | MultiDiscrete | MultiBinary) and actions.shape[1:] != space.shape:
+    if not isinstance(space, DictSpace) and actions.shape[1:] != space.shape:
         expected = list(space.shape)
         raise IllegalAction(
             f"actions of {agents[batch.agents[0]]} have shape {list(actions.shape[1:])}, not {expected}"
@@ -302,7 +272,7 @@ def legal_rows(actions: NDArray, space: Space, mask: NDArray | None) -> NDArray:
             indices = actions - space.start
             legal = (indices >= 0) & (indices < space.n)
             if mask is not None:
-                legal &= mask[np.arange(len(mask)), np.where(legal, indices, 0)] != 0
+                legal &= mask.take(np.arange(0, mask.size, mask.shape[1]) + indices, mode="clip") != 0
             return legal
         case MultiDiscrete():
             choices = np.asarray(space.nvec).ravel()
@@ -328,33 +298,3 @@ def allows_nothing(mask: NDArray, space: Space) -> NDArray:
         return ~(mask != 0).any(axis=1)
     choices = np.asarray(space.nvec).ravel()
     return (np.add.reduceat(mask != 0, np.cumsum(choices) - choices, axis=1, dtype=int) == 0).any(axis=1)
-
-
-class CrashLimit:
-    """Counts the consecutive crashes of each environment."""
-
-    def __init__(self, num_envs: int, most: int) -> None:
-        """most: number of consecutive crashes after which an environment is recreated; the next one is raised."""
-        self._most = most
-        self._consecutive = np.zeros(num_envs, np.int64)
-
-    def count(self, env: int, seed: int, error: Exception) -> None:
-        """Count a crash in the episode with that seed, and log it.
-
-        Raises `error` if it is one too many, with a note that names the seed.
-        """
-        self._consecutive[env] += 1
-        if self._consecutive[env] > self._most:
-            error.add_note(f"in the episode with seed {seed}")
-            raise error
-        logger.warning(
-            "The environment raised in the episode with seed %d and is recreated (%d of %d consecutive times): %s",
-            seed,
-            self._consecutive[env],
-            self._most,
-            one_line(error, with_type=True),
-        )
-
-    def finish(self, envs: Indices) -> None:
-        """Start counting anew: these environments have finished an episode."""
-        self._consecutive[envs] = 0

@@ -187,12 +187,5 @@ def _merged(blocks: Sequence[AgentRows]) -> AgentRows:
     """Return the rows of some blocks in one, sorted by environment, then by agent."""
     if len(blocks) == 1:
         return blocks[0]
-    rows = AgentRows(
-        np.concatenate([block.envs for block in blocks]),
-        np.concatenate([block.agents for block in blocks]),
-        {name: np.concatenate([block.observations[name] for block in blocks]) for name in blocks[0].observations},
-        np.concatenate([block.rewards for block in blocks]),
-        np.concatenate([block.terminations for block in blocks]),
-        np.concatenate([block.truncations for block in blocks]),
-    )
+    rows = AgentRows.concatenated(blocks)
     return rows.take(np.lexsort((rows.agents, rows.envs)))

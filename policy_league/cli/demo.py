@@ -83,7 +83,7 @@ def _train(config: "LeagueConfig", minutes: float) -> None:
 
 def _play(config: "LeagueConfig", url: str) -> None:
     from evaluation.playback.single_game import play_game
-    from league.environments.lockstep import stock_stepping
+    from league.environments.implementation import stock_stepping
     from league.policies.open_inference import remote_policies
     from league.policies.scripted import script
     from league.refs import RemoteRef, ScriptRef

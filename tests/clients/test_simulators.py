@@ -12,7 +12,7 @@ from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import round_robin
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.policies.scripted import script
 from tests.support import simulators
 from tests.support.servers.streaming import listening

@@ -16,7 +16,7 @@ import yaml
 from league.config.league import LeagueConfig
 from league.environments.building import interface
 from league.environments.external import advertisement
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import BatchedEnvironment, each_agent_alone
 from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry

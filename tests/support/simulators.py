@@ -8,7 +8,7 @@ from typing import Any
 
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import LeagueError
 from league.registry.gateways import ForSimulators, Gateway

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, agent_interface, build
-from league.environments.implementation import implementation, stepping
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import implementation, stepping, stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, States, Turn
 from league.environments.vector.vector_env import AgentRows
+from league.errors import LeagueError
 from tests.conformance.stepping import lockstep
 from tests.support import simulators
 from tests.support.environments import faulty_steps, masked, vector_copies
@@ -135,9 +135,9 @@ def turns(name: str, make: Make, **options: Any) -> list[Any]:
                 if not turn.batches:
                     break
         except (Exception, faulty_steps.Interrupt) as error:
-            notes = list(getattr(error, "__notes__", []))
-            is_timed = (batched.seconds() > 0).tolist()
-            documents.append([type(error).__name__, str(error), notes, batched.busy.tolist(), is_timed])
+            documents.append([type(error).__name__, str(error), *getattr(error, "__notes__", [])])
+            if not isinstance(error, LeagueError):  # those of a game, which the match loop names
+                documents.append([batched.busy.tolist(), (batched.seconds() > 0).tolist()])
     return (
         [*documents, {"closed": list(faulty_steps.CLOSED)}]
         if name == INTERRUPTED and make is stock_stepping

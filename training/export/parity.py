@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 
 from league.config.environment import EnvironmentConfig
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import Batch, Indices, Starts
 from league.errors import ObservationError, ParityError, one_line
 from league.interface import Interface

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import Turn, each_agent_alone
 from league.errors import EnvironmentMismatch
 from league.interface import AgentInterface, Interface

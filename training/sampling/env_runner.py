@@ -25,8 +25,7 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME, WEIGHTS_SEQ_
 from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
-from league.environments.implementation import stepping
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stepping, stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import ConfigError, LeagueError
 from league.interface import Interface

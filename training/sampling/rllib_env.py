@@ -16,6 +16,7 @@ from ray.tune.registry import register_env
 
 from league.config.league import LeagueConfig
 from league.environments.building import build, interface
+from league.environments.copies import StockCopies
 from league.environments.lockstep import Lockstep
 from league.environments.stepping import Turn, each_agent_alone
 from league.errors import EnvironmentMismatch
@@ -59,7 +60,7 @@ class LeagueEnv(MultiAgentEnv):
         self.observation_space = gymnasium.spaces.Dict(self.observation_spaces)
         self.action_space = gymnasium.spaces.Dict(self.action_spaces)
         self._infos = InfoRecorder(build(league.environment, render_mode))
-        self._stepping = Lockstep(lambda: self._infos.env, 1)
+        self._stepping = Lockstep(StockCopies(lambda: self._infos.env, 1))
         self._seeds: ResetSeeds | None = None
         self._episodes = 0
 

@@ -23,7 +23,7 @@ from league.environments.external.messages import (
 )
 from league.environments.stepping import (
     Batch,
-    EpisodeStepping,
+    BatchedEnvironment,
     Indices,
     NextEpisodes,
     Turn,
@@ -85,7 +85,7 @@ class _Rows:
         return _Rows(envs=envs[order], agents=agents[order], observations=observations, **columns)
 
 
-class ExternalStepping(EpisodeStepping):
+class ExternalStepping(BatchedEnvironment):
     """Implements BatchedEnvironment by simulators that connect to a gateway.
 
     A turn contains the agents that have reported: those of slow simulators come in later turns. Episodes wait until a
@@ -101,7 +101,7 @@ class ExternalStepping(EpisodeStepping):
         simulators: ForSimulators,
     ) -> None:
         """Open the gateway, and announce it in the registry while episodes are needed. agents: their spaces."""
-        super().__init__(tuple(agents), num_envs, 0)
+        super().__init__(tuple(agents), num_envs)
         self._config, self._league = config, simulators.league
         self._alone_since = perf_counter()
         self._next_check = 0.0
@@ -122,9 +122,8 @@ class ExternalStepping(EpisodeStepping):
 
     def _clear(self) -> None:
         shape = self.num_envs, len(self.agents)
-        # Of each environment: its episode, the seed, the simulator that plays it, since when this one is to report.
+        # Of each environment: its episode, the simulator that plays it, since when this one is to report.
         self._episodes = np.full(self.num_envs, NO_EPISODE)
-        self._seeds = np.zeros(self.num_envs, np.int64)
         self._link_of = np.zeros(self.num_envs, np.int64)
         self._waiting_since = np.full(self.num_envs, np.inf)
         self._has_acted = np.zeros(self.num_envs, bool)
@@ -201,9 +200,7 @@ class ExternalStepping(EpisodeStepping):
 
     def _begin(self, free: Indices) -> None:
         """Let the next episodes of free environments wait for simulators."""
-        envs, seeds = self._starts(free)
-        self._seeds[envs] = seeds
-        for env in envs.tolist():
+        for env in self._starts(free).tolist():
             self._enqueue(env)
         self._hand_out()
 

@@ -5,7 +5,7 @@ same actions each time.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,7 @@ class Twins:
         self, copies: NDArray[np.int64], rows: Sequence[AgentRows], twins: Sequence[AgentRows], where: RowNames
     ) -> None:
         for block, twin in zip(rows, twins, strict=True):
-            check_rows(_moved(twin), block, where)
+            check_rows(replace(twin, envs=twin.envs - COPIES), block, where)
         state, twin_state = self._env.state(copies), self._env.state(copies + COPIES)
         if state is not None and twin_state is not None:
             check_column("state", twin_state, state, lambda row: where.text(int(copies[row])), where.other)
@@ -101,8 +101,3 @@ def acting(rows: Sequence[AgentRows]) -> NDArray[np.int64]:
 def _of(rows: Sequence[AgentRows], copies: NDArray[np.int64]) -> list[AgentRows]:
     """Return the rows of some copies, without those of agents that have left."""
     return [block.take(np.flatnonzero(np.isin(block.envs, copies) & ~block.has_ended)) for block in rows]
-
-
-def _moved(rows: AgentRows) -> AgentRows:
-    fields: dict[str, Any] = {name: getattr(rows, name) for name in AgentRows.__slots__}
-    return AgentRows(**fields | {"envs": rows.envs - COPIES})

@@ -42,6 +42,16 @@ class AgentRows:
         """Whether each row is the last one of its agent, (k,)."""
         return self.terminations | self.truncations
 
+    @staticmethod
+    def concatenated(blocks: Sequence["AgentRows"]) -> "AgentRows":
+        """Return the rows of blocks with the same observation space, one block after the other."""
+        observations = {
+            name: np.concatenate([block.observations[name] for block in blocks]) for name in blocks[0].observations
+        }
+        columns = [(rows.envs, rows.agents, rows.rewards, rows.terminations, rows.truncations) for rows in blocks]
+        envs, agents, *reports = map(np.concatenate, zip(*columns, strict=True))
+        return AgentRows(envs, agents, observations, *reports)
+
     def take(self, chosen: NDArray[np.int64]) -> "AgentRows":
         """Return some of the rows, in the given order."""
         return AgentRows(

@@ -25,8 +25,7 @@ from evaluation.playback.single_game import play_game
 from evaluation.schedules.builders import game_plans, round_robin
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.environments.implementation import stepping
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stepping, stock_stepping
 from league.environments.stepping import Batch
 from league.errors import EnvironmentMismatch, GameHung, InvalidInput
 from league.policies.draws import probabilities

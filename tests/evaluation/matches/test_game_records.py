@@ -27,7 +27,7 @@ from evaluation.playback.replay import recorded_game, replay
 from evaluation.schedules.builders import round_robin
 from evaluation.statistics.payoff import paired_difference, tabulate
 from league.conditions import Conditions
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.errors import EnvironmentMismatch, IllegalMask
 from league.policies.loading import contestant
 from league.policies.policy import Actions, Arrays, Policy

@@ -6,10 +6,12 @@ import sys
 from pathlib import Path
 from threading import Event
 
+import numpy as np
 import pytest
 
 from evaluation.matches import watchdog
 from evaluation.matches.watchdog import TICK, Deadline, GameTimeout, close_in_time, enforce_deadline
+from league.environments.copies import StockCopies
 from league.environments.lockstep import Lockstep
 from league.errors import GameHung
 from tests.support.environments.engines import RUNNING, engine
@@ -86,8 +88,8 @@ def test_an_environment_that_hangs_in_close_is_given_up(
 ) -> None:
     monkeypatch.setattr(watchdog, "CLOSE_SECONDS", 0.05)
     environments = iter([engine(closes="hangs"), engine(), engine()])
-    stepping = Lockstep(lambda: next(environments), 3)
-    stepping._busy = 0  # it was interrupted
+    stepping = Lockstep(StockCopies(lambda: next(environments), 3))
+    stepping.copies.busy = np.array([0])  # it was interrupted
     close_in_time(stepping)
     assert RUNNING == []
     assert [record.message for record in caplog.records] == ["the environment's close has not ended after 0.05 s"]

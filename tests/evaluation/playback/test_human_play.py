@@ -28,7 +28,7 @@ from league.conditions import ActionSelection
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import EnvironmentMismatch, GameCrashed, IllegalAction, InvalidInput, RemoteError
 from league.interface import Interface

@@ -32,7 +32,7 @@ from evaluation.playback.video import FrameComposer, show_window, write_video
 from league.config.league import LeagueConfig
 from league.environments import building
 from league.environments.building import build, interface
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.errors import ConfigError, EnvironmentMismatch, InvalidReference, NotFound, StorageError, UnknownPolicy
 from league.interface import AgentInterface, Interface
 from league.policies.loading import contestant

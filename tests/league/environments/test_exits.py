@@ -14,6 +14,7 @@ from league.config.league import LeagueConfig
 from league.entry_points import import_module
 from league.environments.building import build
 from league.environments.conformance.examination import examine
+from league.environments.copies import StockCopies
 from league.environments.lockstep import Lockstep
 from league.environments.stepping import each_agent_alone
 from league.errors import ConfigError, ExitCalled, no_exit, raised_at
@@ -101,7 +102,7 @@ def test_what_exits_cannot_be_created_or_imported(tmp_path: Path) -> None:
     message = r"fails on import: ExitCalled: sys\.exit\('no display'\) was called \(.*exits_on_import\.py, line 2\)"
     with pytest.raises(ConfigError, match=message):
         import_module("environment.entry_point", "exits_on_import", str(tmp_path))
-    stepping = Lockstep(lambda: Exiting("step"), 1, crashes=1)
+    stepping = Lockstep(StockCopies(lambda: Exiting("step"), 1, 1))
     turn = stepping.start(each_agent_alone([5], 2))
     crashed = stepping.step({group: np.zeros(len(batch), np.int64) for group, batch in turn.batches.items()}).crashed
     assert crashed.tolist() == [0], "its episode has crashed"

@@ -6,11 +6,11 @@ import pytest
 
 from league.config.environment import EnvironmentConfig
 from league.environments import implementation as choices
+from league.environments.copies import Copies, StockCopies, VectorCopies
 from league.environments.implementation import VECTORISED, implementation, stepping
 from league.environments.lockstep import Lockstep
-from league.environments.stepping import Turn, each_agent_alone
+from league.environments.stepping import BatchedEnvironment, Turn, each_agent_alone
 from league.environments.vector.connect_four import ConnectFour
-from league.environments.vector_stepping import VectorStepping
 from league.errors import ConfigError
 from tests.support.environments.vector_copies import VectorMeeting
 
@@ -23,6 +23,11 @@ CONNECT_FOUR = "pettingzoo.classic.connect_four_v3"
 COPIES = "tests.support.environments.vector_copies"
 
 
+def copies_of(env: BatchedEnvironment) -> Copies:
+    assert isinstance(env, Lockstep)
+    return env.copies
+
+
 def test_verified_environments_are_vectorised(monkeypatch: pytest.MonkeyPatch) -> None:
     for entry_point in VECTORISED:
         choice = implementation(EnvironmentConfig(entry_point=entry_point))
@@ -30,7 +35,7 @@ def test_verified_environments_are_vectorised(monkeypatch: pytest.MonkeyPatch) -
         assert choice.reason.startswith("It is vectorised by league.environments.vector")
     config = EnvironmentConfig.model_validate({"entry_point": SPREAD, "wrappers": ["frame_stack_v1"]})
     assert implementation(config).reason.endswith("mpe.simple_spread:SimpleSpread, with frame_stack_v1.")
-    assert isinstance(stepping(config, 2), VectorStepping)
+    assert isinstance(copies_of(stepping(config, 2)), VectorCopies)
     monkeypatch.setattr(choices, "installed", lambda: choices.VERIFIED | {"supersuit": "9.9.9"})
     assert implementation(config).vector is None
     assert "equals supersuit" in implementation(config).reason
@@ -55,13 +60,13 @@ def test_other_environments_are_stepped_in_lockstep(subtests: pytest.Subtests) -
             choice = implementation(environment)
             assert choice.vector is None
             assert re.search(reason, choice.reason)
-            assert "kwargs" in config or isinstance(stepping(environment, 1), Lockstep)
+            assert "kwargs" in config or isinstance(copies_of(stepping(environment, 1)), StockCopies)
 
 
 def test_users_name_their_own_vectorised_environment() -> None:
     config = EnvironmentConfig(entry_point=VectorMeeting.entry_point, vector=f"{COPIES}:VectorMeeting")
     assert implementation(config).vector is VectorMeeting
-    assert isinstance(stepping(config, 2), VectorStepping)
+    assert isinstance(copies_of(stepping(config, 2)), VectorCopies)
     assert config.digest() == EnvironmentConfig(entry_point=config.entry_point).digest()
     for vector in ("nowhere:Env", f"{COPIES}:Nothing", f"{COPIES}:np", "no colon", ""):
         with pytest.raises(ConfigError, match=r"environment\.vector"):

@@ -12,7 +12,7 @@ from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.building import build, interface
 from league.environments.conformance.examination import examine
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import each_agent_alone
 from league.errors import EnvironmentMismatch, IllegalAction
 from league.spaces import ACTION_MASK, OBSERVATION, DictSpace, inputs

@@ -18,7 +18,9 @@ from ray.rllib.env.multi_agent_env import MultiAgentEnv
 
 from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build
-from league.environments.lockstep import Lockstep, stock_stepping
+from league.environments.copies import StockCopies
+from league.environments.implementation import stock_stepping
+from league.environments.lockstep import Lockstep
 from league.environments.stepping import BatchedEnvironment, Turn, each_agent_alone
 from league.errors import ConfigError, EnvironmentMismatch, IllegalAction, InvalidReward
 from tests.conformance.stepping import (
@@ -89,7 +91,7 @@ def test_checking_wrappers_are_removed_and_others_kept() -> None:
     assert begin(env, [0]).batches[0].observations["observation"].shape == (1, 6)
 
 
-def test_a_crash_affects_its_own_episode_only() -> None:
+def test_a_crash_affects_its_own_episode_only(caplog: pytest.LogCaptureFixture) -> None:
     for crashes, seeds, num_envs, crashed in (([1], 3, 2, [1]), ([0, 2, 4], 6, 1, [0, 0, 0])):
         env = stock_stepping(config(crashes=crashes), num_envs, crashes=1)  # only consecutive ones are limited
         turns = list(turns_until_the_end(env, begin(env, list(range(seeds)))))
@@ -99,6 +101,7 @@ def test_a_crash_affects_its_own_episode_only() -> None:
     env = stock_stepping(config(crashes=list(range(10))), 1, crashes=2)
     with pytest.raises(RuntimeError, match="simulator is gone"):
         list(turns_until_the_end(env, env.start(each_agent_alone(itertools.count(), 2))))
+    assert "seed 1 and is recreated (2 of 2 consecutive times): RuntimeError: the simulator" in caplog.messages[-1]
 
 
 def test_the_last_observation_survives_the_next_reset() -> None:
@@ -240,7 +243,7 @@ class WithState(Simultaneous):
 
 def turns_of(make: Callable[[], Any], steps: int, states: bool = True) -> list[tuple[dict[int, Any], dict[int, Any]]]:
     """States and last states of each turn of one environment, whose episodes have the seeds 1, 2, …"""
-    lockstep = Lockstep(make, 1, states=states)
+    lockstep = Lockstep(StockCopies(make, 1), states)
     turn = lockstep.start(episodes(range(1, 99), [0] * len(lockstep.agents)))
     turns = [turn]
     for _ in range(steps):

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.environments.conformance.examination import examine
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import each_agent_alone
 from league.errors import InvalidReturn
 from tests.support.environments.masked import AGENTS, ParallelMasked, RLlibMasked, TurnMasked

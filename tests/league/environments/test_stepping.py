@@ -4,7 +4,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from league.environments.stepping import Batch, CrashLimit, allows_nothing, check_actions
+from league.environments.stepping import Batch, allows_nothing, check_actions
 from league.errors import IllegalAction
 from league.spaces import ACTION_MASK
 from league.spaces.conversion import from_gymnasium
@@ -69,17 +69,3 @@ def test_an_action_outside_its_space_is_rejected_with_its_agent(subtests: pytest
         check(spaces.Discrete(3), np.array([1]))
     with pytest.raises(IllegalAction, match=r"have shape \[1\], not \[2\]"):
         check(spaces.Box(-1, 1, (2,)), np.zeros((2, 1), np.float32))
-
-
-def test_the_crash_after_the_most_is_raised(caplog: pytest.LogCaptureFixture) -> None:
-    crashes = CrashLimit(num_envs=2, most=2)
-    crashes.count(1, 7, ValueError("first"))
-    crashes.count(1, 8, ValueError("second"))
-    assert "seed 8" in caplog.messages[1]
-    assert "(2 of 2 consecutive times): ValueError: second" in caplog.messages[1]
-    crashes.count(0, 8, ValueError("first"))
-    crashes.finish(np.array([0]))
-    for _ in range(2):  # a finished episode ends the count of its environment
-        crashes.count(0, 0, ValueError("again"))
-    with pytest.raises(ValueError, match="third"):
-        crashes.count(1, 9, ValueError("third"))

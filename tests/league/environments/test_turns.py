@@ -4,8 +4,7 @@ from typing import Any
 
 import pytest
 
-from league.environments.implementation import stepping
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stepping, stock_stepping
 from tests.support.closeness import close
 from tests.support.recordings import read
 from tests.support.turns import FAULTS, INTERRUPTED, STOCK, TURNS, external, turns

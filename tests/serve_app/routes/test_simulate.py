@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from evaluation.matches.game_loop import play_matches
 from evaluation.schedules.builders import round_robin
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.errors import Forbidden, InvalidInput, LeagueError, Unauthenticated, UnknownLeague
 from league.registry.registry import Registry
 from policy_league_client.endpoint import Endpoint

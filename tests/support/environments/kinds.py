@@ -10,7 +10,7 @@ from evaluation.matches.seating import Roster
 from evaluation.schedules.builders import round_robin
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.interface import Interface
 from league.policies.onnx import OnnxPolicy
 from league.policies.scripted import script

@@ -11,7 +11,7 @@ from league.config.league import LeagueConfig
 from league.config.opponents import OpponentConfig
 from league.config.ppo import PPOConfig
 from league.environments.building import interface as interface_of
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.errors import EnvironmentMismatch
 from league.random.seeds import generator
 from tests.support.environments.scripted_environment import AgentRecord, Scripted, interface

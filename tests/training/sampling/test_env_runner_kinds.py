@@ -25,9 +25,10 @@ from ray.rllib.utils.metrics import (
 from league.config.league import LeagueConfig
 from league.environments import lockstep
 from league.environments.building import interface
-from league.environments.lockstep import stock_stepping
+from league.environments.copies import VectorCopies
+from league.environments.implementation import stock_stepping
+from league.environments.lockstep import Lockstep
 from league.environments.stepping import BatchedEnvironment
-from league.environments.vector_stepping import VectorStepping
 from league.errors import ConfigError, InvalidReward
 from league.policies.actions import to_environment
 from league.registry.registry import Registry
@@ -363,7 +364,8 @@ def trained(league: LeagueConfig) -> tuple[list[list[EpisodeChunks]], dict[str, 
         runner.module.set_state(learner.module.get_state())
         samples.append(runner.sample_chunks(num_timesteps=120))
         update(learner, samples[-1], num_epochs=1, minibatch_size=32)
-    assert isinstance(runner.env, VectorStepping) == (env_runner.stepping is not in_lockstep)
+    assert isinstance(runner.env, Lockstep)
+    assert isinstance(runner.env.copies, VectorCopies) == (env_runner.stepping is not in_lockstep)
     runner.stop()
     return samples, learner.module.get_state()
 

@@ -21,7 +21,7 @@ from evaluation.schedules.builders import round_robin
 from league.config.league import LeagueConfig
 from league.environments.external import advertisement
 from league.environments.external import stepping as external_stepping
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.stepping import BatchedEnvironment, Starts, Turn, each_agent_alone
 from league.errors import EnvironmentMismatch, LeagueError
 from league.registry.gateways import Gateway

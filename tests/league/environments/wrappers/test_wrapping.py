@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as arrays
 
 from league.config.environment import EnvironmentConfig
 from league.environments.building import action_space, build
-from league.environments.lockstep import stock_stepping
+from league.environments.implementation import stock_stepping
 from league.environments.wrappers.transforms import Resize
 from league.environments.wrappers.wrapping import BatchedWrappers
 from league.errors import ConfigError
