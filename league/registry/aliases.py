@@ -22,7 +22,7 @@ from league.errors import AliasMoved, NothingToRollBack
 from league.refs import CHAMPION, check_alias
 from league.registry import leagues, verdicts, versions
 from league.registry.storage import change_counter
-from league.registry.storage.database import Repository, repeat_after_deadlock
+from league.registry.storage.database import Repository, as_method, reading, writing
 from league.registry.storage.idempotency import IdempotentCall, apply_once
 from league.registry.storage.rows import AliasEvent, AliasTarget
 from league.registry.storage.tables import AliasTable
@@ -38,22 +38,27 @@ ANY = AnyVersion.ANY
 _ALL = select(*(AliasTable.__table__.c[name] for name in ("league", "name", "version", "event")))
 
 
+def current(session: Session, league: str) -> dict[str, int]:
+    """Return alias → version. Raises UnknownLeague."""
+    leagues.require(session, league)
+    aliases = session.scalars(select(AliasTable).filter_by(league=league).order_by(AliasTable.name))
+    return {alias.name: alias.version for alias in aliases}
+
+
 class AliasRepository(Repository):
     """Sets, rolls back and reads aliases."""
 
-    def current(self, league: str) -> dict[str, int]:
-        """Return alias → version. Raises UnknownLeague."""
-        with self._database.read() as session:
-            return current(session, league)
+    current = as_method(current)
 
     def all(self) -> dict[tuple[str, str], AliasTarget]:
         """Return (league, alias) → its target, of all leagues, by one cheap query."""
         rows = self._database.rows(_ALL)
         return {(league, name): AliasTarget(version, event) for league, name, version, event in rows}
 
-    @repeat_after_deadlock
+    @writing
     def set(
         self,
+        session: Session,
         league: str,
         alias: str,
         version: int,
@@ -72,30 +77,32 @@ class AliasRepository(Repository):
         `verdict` is closed, or AliasMoved if the alias points elsewhere.
         """
         check_alias(alias)
-        with self._database.write() as session:
-            leagues.lock(session, league)
+        leagues.lock(session, league)
 
-            def change() -> AliasEvent:
-                if verdict is not None:
-                    verdicts.require_open(session, verdict)
-                last = _check(session, league, alias, version, expected)
-                if last and last.version == version:
-                    return last
-                beneath = last.id if last else None
-                return _record(
-                    session, league, alias, last, "set", version, beneath, actor=actor, reason=reason, verdict=verdict
-                )
+        def change() -> AliasEvent:
+            if verdict is not None:
+                verdicts.require_open(session, verdict)
+            last = _check(session, league, alias, version, expected)
+            if last and last.version == version:
+                return last
+            beneath = last.id if last else None
+            return _record(
+                session, league, alias, last, "set", version, beneath, actor=actor, reason=reason, verdict=verdict
+            )
 
-            return apply_once(session, call, "event", change=change, load=partial(session.get_one, AliasEvent))
+        return apply_once(session, call, "event", change=change, load=partial(session.get_one, AliasEvent))
 
-    def check(self, league: str, alias: str, version: int, *, expected: int | AnyVersion | None) -> None:
+    @reading
+    def check(
+        self, session: Session, league: str, alias: str, version: int, *, expected: int | AnyVersion | None
+    ) -> None:
         """Raise what `set` would raise now, and change nothing: for callers that ask for confirmation first."""
-        with self._database.read() as session:
-            _check(session, league, alias, version, expected)
+        _check(session, league, alias, version, expected)
 
-    @repeat_after_deadlock
+    @writing
     def rollback(
         self,
+        session: Session,
         league: str,
         *,
         expected: int | AnyVersion = ANY,
@@ -108,29 +115,30 @@ class AliasRepository(Repository):
         A repeated `call` changes nothing and returns its event. Raises UnknownLeague, AliasMoved, NothingToRollBack or
         KeyReused.
         """
-        with self._database.write() as session:
-            leagues.lock(session, league)
+        leagues.lock(session, league)
 
-            def change() -> AliasEvent:
-                last = _in_force(session, league, CHAMPION)
-                _require(last, league, CHAMPION, expected)
-                beneath = session.get(AliasEvent, last.beneath) if last and last.beneath else None
-                if beneath is None:
-                    reason_against = (
-                        f"has no version before {league}@{last.version} to return to"
-                        if last
-                        else "is not set: promote a version"
-                    )
-                    raise NothingToRollBack(f"alias {CHAMPION} of league {league} {reason_against}")
-                version, next_beneath = beneath.version, beneath.beneath
-                return _record(
-                    session, league, CHAMPION, last, "rollback", version, next_beneath, actor=actor, reason=reason
+        def change() -> AliasEvent:
+            last = _in_force(session, league, CHAMPION)
+            _require(last, league, CHAMPION, expected)
+            beneath = session.get(AliasEvent, last.beneath) if last and last.beneath else None
+            if beneath is None:
+                reason_against = (
+                    f"has no version before {league}@{last.version} to return to"
+                    if last
+                    else "is not set: promote a version"
                 )
+                raise NothingToRollBack(f"alias {CHAMPION} of league {league} {reason_against}")
+            version, next_beneath = beneath.version, beneath.beneath
+            return _record(
+                session, league, CHAMPION, last, "rollback", version, next_beneath, actor=actor, reason=reason
+            )
 
-            return apply_once(session, call, "event", change=change, load=partial(session.get_one, AliasEvent))
+        return apply_once(session, call, "event", change=change, load=partial(session.get_one, AliasEvent))
 
+    @reading
     def history(
         self,
+        session: Session,
         league: str,
         alias: str = CHAMPION,
         at: datetime | None = None,
@@ -148,14 +156,7 @@ class AliasRepository(Repository):
             query = query.where(table.id < before)
         if at is not None:
             query = query.where(table.at <= at).limit(1)
-        return leagues.rows(self._database, league, query)
-
-
-def current(session: Session, league: str) -> dict[str, int]:
-    """Return alias → version. Raises UnknownLeague."""
-    leagues.require(session, league)
-    aliases = session.scalars(select(AliasTable).filter_by(league=league).order_by(AliasTable.name))
-    return {alias.name: alias.version for alias in aliases}
+        return leagues.rows(session, league, query)
 
 
 def _check(

@@ -5,12 +5,13 @@ from collections.abc import Callable
 from datetime import timedelta
 
 from sqlalchemy import ColumnElement, ScalarSelect, and_, func, or_, select, true
+from sqlalchemy.orm import Session
 
 from league.errors import AliasMoved, Conflict, NotReady
 from league.registry import aliases, evaluations, replicas
 from league.registry.replicas import LIVENESS_TIMEOUT, ReplicaRepository
 from league.registry.storage import change_counter
-from league.registry.storage.database import Database, Repository
+from league.registry.storage.database import Database, Repository, reading
 from league.registry.storage.rows import (
     Acknowledgement,
     AliasEvent,
@@ -53,7 +54,8 @@ class ChangeRepository(Repository):
         """
         return change_counter.counts(self._database)
 
-    def token(self, league: str, since: timedelta = LIVENESS_TIMEOUT) -> ChangeToken:
+    @reading
+    def token(self, session: Session, league: str, since: timedelta = LIVENESS_TIMEOUT) -> ChangeToken:
         """Return the change token of a league, which differs after any change. Raises UnknownLeague.
 
         Cheap enough for polling: each query reads the end of an index, or a few rows.
@@ -61,22 +63,21 @@ class ChangeRepository(Repository):
         """
         outcomes = select(VerdictRow.outcome, func.count()).filter_by(league=league).group_by(VerdictRow.outcome)
         newest_run = select(RunRow.id).filter_by(league=league).order_by(RunRow.began_at.desc(), RunRow.id.desc())
-        with self._database.read() as session:
-            return ChangeToken(
-                league=league,
-                aliases=aliases.current(session, league),
-                event=session.scalar(select(func.max(AliasTable.event)).filter_by(league=league)),
-                version=session.scalar(select(func.max(VersionTable.number)).filter_by(league=league, state=READY)),
-                note=session.scalar(select(func.max(VersionNoteTable.id)).filter_by(league=league)),
-                traffic=session.scalar(select(func.max(TrafficEventTable.id)).filter_by(league=league)),
-                serving=replicas.serving(session, league, since),
-                verdicts={outcome or OPEN: count for outcome, count in session.execute(outcomes)},
-                evaluation=session.scalar(select(func.max(EvaluationRow.id)).filter_by(league=league)),
-                evaluations=evaluations.active(session, league),
-                run=session.scalar(newest_run.limit(1)),
-                runs=runs.active(session, league),
-                computed_at=session.scalar(select(func.max(SnapshotRow.at)).filter_by(league=league)),
-            )
+        return ChangeToken(
+            league=league,
+            aliases=aliases.current(session, league),
+            event=session.scalar(select(func.max(AliasTable.event)).filter_by(league=league)),
+            version=session.scalar(select(func.max(VersionTable.number)).filter_by(league=league, state=READY)),
+            note=session.scalar(select(func.max(VersionNoteTable.id)).filter_by(league=league)),
+            traffic=session.scalar(select(func.max(TrafficEventTable.id)).filter_by(league=league)),
+            serving=replicas.serving(session, league, since),
+            verdicts={outcome or OPEN: count for outcome, count in session.execute(outcomes)},
+            evaluation=session.scalar(select(func.max(EvaluationRow.id)).filter_by(league=league)),
+            evaluations=evaluations.active(session, league),
+            run=session.scalar(newest_run.limit(1)),
+            runs=runs.active(session, league),
+            computed_at=session.scalar(select(func.max(SnapshotRow.at)).filter_by(league=league)),
+        )
 
     def wait_for_alias(
         self, event: AliasEvent, timeout: float, sleep: Callable[[float], None] = time.sleep
@@ -163,8 +164,7 @@ class ChangeRepository(Repository):
         deadline = time.monotonic() + timeout
         next_search = time.monotonic() + ENDED_SECONDS
         while True:
-            with self._database.read() as session:
-                registered, following, current = session.execute(count).one()
+            ((registered, following, current),) = self._database.rows(count)
             check(current)
             if registered and following == registered:
                 return self._names(league, follows)
@@ -187,10 +187,10 @@ class ChangeRepository(Repository):
                 next_search = time.monotonic() + ENDED_SECONDS
             sleep(POLL_SECONDS)
 
-    def _names(self, league: str, condition: ColumnElement[bool]) -> list[str]:
+    @reading
+    def _names(self, session: Session, league: str, condition: ColumnElement[bool]) -> list[str]:
         query = select(ReplicaTable.replica).select_from(replicas.with_acknowledgement(league)).where(condition)
-        with self._database.read() as session:
-            return list(session.scalars(query.order_by(ReplicaTable.replica)))
+        return list(session.scalars(query.order_by(ReplicaTable.replica)))
 
 
 def _serves(found: Acknowledgement, alias: str) -> str:

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from league.errors import TooManyEvaluations, UnknownEvaluation
 from league.registry import leagues
-from league.registry.storage.database import Repository
+from league.registry.storage.database import Repository, reading, writing
 from league.registry.storage.idempotency import IdempotentCall, apply_once
 from league.registry.storage.rows import EvaluationRow, EvaluationState
 
@@ -37,8 +37,10 @@ GIVEN_UP = {
 class EvaluationRepository(Repository):
     """Queues, claims, updates and reads evaluations."""
 
+    @writing
     def submit(
         self,
+        session: Session,
         league: str,
         request: dict[str, Any],
         *,
@@ -55,44 +57,46 @@ class EvaluationRepository(Repository):
         two concurrent submissions for different leagues may exceed it by one. max_of_league: the limit of this league.
         Raises UnknownLeague, TooManyEvaluations or KeyReused.
         """
-        with self._database.write() as session:
-            leagues.lock(session, league)
+        leagues.lock(session, league)
 
-            def change() -> EvaluationRow:
-                active = select(func.count()).where(EvaluationRow.state.in_((QUEUED, RUNNING)))
-                for query, limit, where in (
-                    (active, max_active, ""),
-                    (
-                        active.where(EvaluationRow.league == league),
-                        max_active if max_of_league is None else max_of_league,
-                        f" of {league}",
-                    ),
-                ):
-                    if (waiting := session.scalar(query) or 0) >= limit:
-                        raise TooManyEvaluations(
-                            f"{waiting} evaluations{where} are queued or running, the limit is {limit}: try again later"
-                        )
-                evaluation = EvaluationRow(
-                    league=league,
-                    request=request,
-                    state=QUEUED,
-                    actor=actor,
-                    key=key,
-                    reason=reason,
-                    created_at=datetime.now(UTC),
-                )
-                session.add(evaluation)
-                session.flush()
-                return evaluation
+        def change() -> EvaluationRow:
+            active = select(func.count()).where(EvaluationRow.state.in_((QUEUED, RUNNING)))
+            for query, limit, where in (
+                (active, max_active, ""),
+                (
+                    active.where(EvaluationRow.league == league),
+                    max_active if max_of_league is None else max_of_league,
+                    f" of {league}",
+                ),
+            ):
+                if (waiting := session.scalar(query) or 0) >= limit:
+                    raise TooManyEvaluations(
+                        f"{waiting} evaluations{where} are queued or running, the limit is {limit}: try again later"
+                    )
+            evaluation = EvaluationRow(
+                league=league,
+                request=request,
+                state=QUEUED,
+                actor=actor,
+                key=key,
+                reason=reason,
+                created_at=datetime.now(UTC),
+            )
+            session.add(evaluation)
+            session.flush()
+            return evaluation
 
-            return apply_once(session, call, "evaluation", change=change, load=partial(session.get_one, EvaluationRow))
+        return apply_once(session, call, "evaluation", change=change, load=partial(session.get_one, EvaluationRow))
 
-    def get(self, league: str, number: int) -> EvaluationRow:
+    @reading
+    def get(self, session: Session, league: str, number: int) -> EvaluationRow:
         """Return one evaluation. Raises UnknownLeague or UnknownEvaluation."""
-        with self._database.read() as session:
-            return _of_league(session, league, number)
+        return _of_league(session, league, number)
 
-    def newest(self, league: str, *, before: int | None = None, limit: int = 20) -> list[EvaluationRow]:
+    @reading
+    def newest(
+        self, session: Session, league: str, *, before: int | None = None, limit: int = 20
+    ) -> list[EvaluationRow]:
         """Return at most `limit` evaluations of a league, newest first. Raises UnknownLeague.
 
         before: return only evaluations with a lower number.
@@ -100,27 +104,27 @@ class EvaluationRepository(Repository):
         query = select(EvaluationRow).filter_by(league=league).order_by(EvaluationRow.id.desc()).limit(limit)
         if before is not None:
             query = query.where(EvaluationRow.id < before)
-        return leagues.rows(self._database, league, query)
+        return leagues.rows(session, league, query)
 
-    def counts(self) -> dict[str, dict[str, int]]:
+    @reading
+    def counts(self, session: Session) -> dict[str, dict[str, int]]:
         """Return league → state → number of queued and running evaluations, of the leagues that have any."""
         table = EvaluationRow
         query = select(table.league, table.state, func.count()).where(table.state.in_((QUEUED, RUNNING)))
         counts: dict[str, dict[str, int]] = {}
-        with self._database.read() as session:
-            for league, state, count in session.execute(query.group_by(table.league, table.state)):
-                counts.setdefault(league, {})[state] = count
+        for league, state, count in session.execute(query.group_by(table.league, table.state)):
+            counts.setdefault(league, {})[state] = count
         return counts
 
-    def stop(self, league: str, number: int, *, actor: str) -> EvaluationRow:
+    @writing
+    def stop(self, session: Session, league: str, number: int, *, actor: str) -> EvaluationRow:
         """Request the end of an evaluation; an ended one is unchanged. Raises UnknownLeague or UnknownEvaluation."""
-        with self._database.write() as session:
-            evaluation = _of_league(session, league, number, lock=True)
-            if evaluation.state in (QUEUED, RUNNING) and evaluation.stop_at is None:
-                evaluation.stop_at, evaluation.stopped_by = datetime.now(UTC), actor
-                if evaluation.state == QUEUED:
-                    _end(evaluation, STOPPED)
-            return evaluation
+        evaluation = _of_league(session, league, number, lock=True)
+        if evaluation.state in (QUEUED, RUNNING) and evaluation.stop_at is None:
+            evaluation.stop_at, evaluation.stopped_by = datetime.now(UTC), actor
+            if evaluation.state == QUEUED:
+                _end(evaluation, STOPPED)
+        return evaluation
 
     def claim(self, runner: str, workers: int) -> EvaluationRow | None:
         """Assign the oldest evaluation that is queued, or whose runner is dead, to `runner`; None if there is none."""
@@ -139,21 +143,25 @@ class EvaluationRepository(Repository):
                     return evaluation
         return None
 
-    def heartbeat(self, number: int, runner: str, progress: dict[str, Any] | None = None) -> EvaluationRow:
+    @writing
+    def heartbeat(
+        self, session: Session, number: int, runner: str, progress: dict[str, Any] | None = None
+    ) -> EvaluationRow:
         """Record a heartbeat of a runner and its progress.
 
         Returns the evaluation, which shows whether it is still assigned to `runner`.
         """
-        with self._database.write() as session:
-            evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
-            if _is_held(evaluation, runner):
-                evaluation.heartbeat_at = datetime.now(UTC)
-                if progress is not None and progress != evaluation.progress:
-                    evaluation.progress, evaluation.attempts = progress, 0
-            return evaluation
+        evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
+        if _is_held(evaluation, runner):
+            evaluation.heartbeat_at = datetime.now(UTC)
+            if progress is not None and progress != evaluation.progress:
+                evaluation.progress, evaluation.attempts = progress, 0
+        return evaluation
 
+    @writing
     def finish(
         self,
+        session: Session,
         number: int,
         runner: str,
         state: EvaluationState,
@@ -163,18 +171,17 @@ class EvaluationRepository(Repository):
         error: dict[str, str] | None = None,
     ) -> None:
         """Record how an evaluation ended, unless another runner has claimed it."""
-        with self._database.write() as session:
-            evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
-            if _is_held(evaluation, runner):
-                evaluation.progress, evaluation.result = progress or evaluation.progress, result
-                _end(evaluation, state, error)
+        evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
+        if _is_held(evaluation, runner):
+            evaluation.progress, evaluation.result = progress or evaluation.progress, result
+            _end(evaluation, state, error)
 
-    def release(self, number: int, runner: str) -> None:
+    @writing
+    def release(self, session: Session, number: int, runner: str) -> None:
         """Queue an unfinished evaluation again because its runner is gone, unless it was to be stopped."""
-        with self._database.write() as session:
-            evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
-            if _is_held(evaluation, runner) and not _ends_here(evaluation):
-                evaluation.state = QUEUED
+        evaluation = session.get_one(EvaluationRow, number, with_for_update=True)
+        if _is_held(evaluation, runner) and not _ends_here(evaluation):
+            evaluation.state = QUEUED
 
 
 def active(session: Session, league: str) -> tuple[EvaluationRow, ...]:

@@ -5,9 +5,10 @@ from datetime import timedelta
 from typing import Literal, cast
 
 from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
 
 from league.registry import leagues
-from league.registry.storage.database import Repository, clock, sql_clock, upsert
+from league.registry.storage.database import Repository, clock, reading, sql_clock, upsert, writing
 from league.registry.storage.tables import GatewayTable
 from league.settings import Storage
 
@@ -54,30 +55,30 @@ class Gateway:
 class GatewayRepository(Repository):
     """Announces gateways, and finds them."""
 
-    def announce(self, gateway: Gateway) -> None:
+    @writing
+    def announce(self, session: Session, gateway: Gateway) -> None:
         """Record that a gateway is open now. Its process repeats that more often than SILENCE.
 
         Raises UnknownLeague.
         """
-        with self._database.write() as session:
-            leagues.require(session, gateway.league)
-            values = {name: getattr(gateway, name) for name in ("league", "purpose", "simulators", "waiting")}
-            key = {"url": gateway.url, "token": gateway.token}
-            upsert(session, GatewayTable, key, values | {"seen_at": sql_clock(session)})
-            session.execute(delete(GatewayTable).where(GatewayTable.seen_at < clock(session) - 4 * SILENCE))
+        leagues.require(session, gateway.league)
+        values = {name: getattr(gateway, name) for name in ("league", "purpose", "simulators", "waiting")}
+        key = {"url": gateway.url, "token": gateway.token}
+        upsert(session, GatewayTable, key, values | {"seen_at": sql_clock(session)})
+        session.execute(delete(GatewayTable).where(GatewayTable.seen_at < clock(session) - 4 * SILENCE))
 
-    def open(self, league: str) -> list[Gateway]:
+    @reading
+    def open(self, session: Session, league: str) -> list[Gateway]:
         """Return the open gateways of a league: those without simulators first, and of these those of evaluations."""
         table = GatewayTable
-        with self._database.read() as session:
-            query = select(table).filter_by(league=league).where(table.seen_at >= clock(session) - SILENCE)
-            rows = session.scalars(query.order_by(table.simulators, table.purpose, table.url)).all()
+        query = select(table).filter_by(league=league).where(table.seen_at >= clock(session) - SILENCE)
+        rows = session.scalars(query.order_by(table.simulators, table.purpose, table.url)).all()
         return [
             Gateway(row.url, row.token, row.league, cast(Purpose, row.purpose), row.simulators, row.waiting)
             for row in rows
         ]
 
-    def close(self, gateway: Gateway) -> None:
+    @writing
+    def close(self, session: Session, gateway: Gateway) -> None:
         """Record that a gateway is closed."""
-        with self._database.write() as session:
-            session.execute(delete(GatewayTable).filter_by(url=gateway.url, token=gateway.token))
+        session.execute(delete(GatewayTable).filter_by(url=gateway.url, token=gateway.token))

@@ -13,12 +13,13 @@ from collections.abc import Collection
 from datetime import UTC, datetime
 
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from league.errors import InvalidInput, NameTaken, UnknownKey
 from league.refs import check_slug
 from league.registry import leagues
 from league.registry.storage import change_counter
-from league.registry.storage.database import Repository, insert
+from league.registry.storage.database import Repository, insert, reading, writing
 from league.registry.storage.rows import KeyRow
 
 PREFIX = "plk"
@@ -30,8 +31,10 @@ TOKEN_LENGTH = len(PREFIX) + 1 + 8 + 1 + 64
 class KeyRepository(Repository):
     """Creates, lists and revokes API keys."""
 
+    @writing
     def create(
         self,
+        session: Session,
         name: str,
         scopes: Collection[str],
         *,
@@ -59,34 +62,33 @@ class KeyRepository(Repository):
             "expires_at": expires_at,
             "revoked_at": None,
         }
-        with self._database.write() as session:
-            for league in only_leagues:
-                leagues.lock(session, league)  # until the key is stored, so that a new league of this name sees it
-            change_counter.count(session, "keys")
-            if not insert(session, KeyRow, [values]):
-                raise NameTaken(f"a key {name!r} exists or existed: names of keys are not reused")
-            return session.get_one(KeyRow, id_), token
+        for league in only_leagues:
+            leagues.lock(session, league)  # until the key is stored, so that a new league of this name sees it
+        change_counter.count(session, "keys")
+        if not insert(session, KeyRow, [values]):
+            raise NameTaken(f"a key {name!r} exists or existed: names of keys are not reused")
+        return session.get_one(KeyRow, id_), token
 
-    def all(self) -> list[KeyRow]:
+    @reading
+    def all(self, session: Session) -> list[KeyRow]:
         """Return all API keys, revoked ones included, oldest first."""
         query = select(KeyRow).order_by(KeyRow.created_at, KeyRow.id)
-        with self._database.read() as session:
-            return list(session.scalars(query))
+        return list(session.scalars(query))
 
-    def revoke(self, name: str) -> KeyRow:
+    @writing
+    def revoke(self, session: Session, name: str) -> KeyRow:
         """Revoke an API key by its name or id. Idempotent. Raises UnknownKey, which lists the names."""
         query = select(KeyRow).where((KeyRow.name == name) | (KeyRow.id == name)).with_for_update()
-        with self._database.write() as session:
-            # A name takes precedence over an equal id of another key.
-            keys = sorted(session.scalars(query), key=lambda key: key.name != name)
-            if not keys:
-                names = ", ".join(session.scalars(select(KeyRow.name).order_by(KeyRow.name))) or "none yet"
-                raise UnknownKey(f"there is no key {name!r}; known: {names}")
-            key = keys[0]
-            if key.revoked_at is None:
-                change_counter.count(session, "keys")
-                key.revoked_at = datetime.now(UTC)
-            return key
+        # A name takes precedence over an equal id of another key.
+        keys = sorted(session.scalars(query), key=lambda key: key.name != name)
+        if not keys:
+            names = ", ".join(session.scalars(select(KeyRow.name).order_by(KeyRow.name))) or "none yet"
+            raise UnknownKey(f"there is no key {name!r}; known: {names}")
+        key = keys[0]
+        if key.revoked_at is None:
+            change_counter.count(session, "keys")
+            key.revoked_at = datetime.now(UTC)
+        return key
 
 
 def digest(token: bytes) -> str:

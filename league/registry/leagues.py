@@ -16,7 +16,7 @@ from league.errors import InterfaceChanged, UnknownLeague
 from league.interface import Interface, digest
 from league.refs import check_new
 from league.registry.storage import change_counter
-from league.registry.storage.database import Database, Repository, insert, upsert
+from league.registry.storage.database import Repository, insert, reading, upsert, writing
 from league.registry.storage.rows import EarlierGameRow, KeyRow, LeagueRow
 from league.registry.storage.tables import READY, MatchTable, ScheduleTable, VersionTable
 
@@ -33,7 +33,8 @@ logger = logging.getLogger(__name__)
 class LeagueRepository(Repository):
     """Registers and reads leagues."""
 
-    def register(self, config: "LeagueConfig", interface: Interface) -> None:
+    @writing
+    def register(self, session: Session, config: "LeagueConfig", interface: Interface) -> None:
         """Add a league or update its configuration. Warns if results exist and what decides them has changed: the game,
         or how versions select actions.
 
@@ -49,56 +50,53 @@ class LeagueRepository(Repository):
             "game_digest": digest(game),
         }
         first = {"slug": config.league, "last_version": 0, "registered_at": datetime.now(UTC)}
-        with self._database.write() as session:
-            if session.get(LeagueRow, config.league) is None:
-                check_new("league", config.league)
-            if insert(session, LeagueRow, [first | values]):
-                change_counter.count(session, "leagues")
-                _end_keys(session, config.league)
-                return
-            row = lock_active(session, config.league)
-            ready = select(VersionTable.number).filter_by(league=config.league, state=READY).limit(1)
-            if row.interface_digest != values["interface_digest"] and session.scalar(ready) is not None:
-                raise InterfaceChanged(
-                    f"league {config.league} has versions with other spaces or policies than this configuration: "
-                    "keep them, or register the configuration under a new league name"
-                )
-            before, selection = _action_selections(session, row.slug)[row.slug], action_selection(config, interface)
-            changes = (
-                [f"how versions select actions has changed: {before} → {selection}"] if before != selection else []
+        if session.get(LeagueRow, config.league) is None:
+            check_new("league", config.league)
+        if insert(session, LeagueRow, [first | values]):
+            change_counter.count(session, "leagues")
+            _end_keys(session, config.league)
+            return
+        row = lock_active(session, config.league)
+        ready = select(VersionTable.number).filter_by(league=config.league, state=READY).limit(1)
+        if row.interface_digest != values["interface_digest"] and session.scalar(ready) is not None:
+            raise InterfaceChanged(
+                f"league {config.league} has versions with other spaces or policies than this configuration: "
+                "keep them, or register the configuration under a new league name"
             )
-            if changes:
-                change_counter.count(session, "leagues")
-            if row.game_digest != values["game_digest"]:
-                changes.insert(0, _describe_changes(row.game, game))
-                # Also without results: a match of a schedule that is open may still be recorded.
-                earlier = {"game": row.game, "replaced_at": datetime.now(UTC)}
-                upsert(session, EarlierGameRow, {"league": row.slug, "digest": row.game_digest}, earlier)
-            if changes and _has_results(session, row.slug):
-                is_back = _has_results(session, row.slug, Conditions(digest(game), selection))
-                logger.warning(
-                    "league %s: %s. %s results can be viewed, but no longer count in ratings, payoffs and verdicts.%s",
-                    row.slug,
-                    "; ".join(changes),
-                    "Later" if is_back else "Earlier",
-                    " The results from when the league last had this game count again." if is_back else "",
-                )
-            row.config_document, row.interface_document = values.pop("config"), values.pop("interface")
-            for name, value in values.items():
-                setattr(row, name, value)
+        before, selection = _action_selections(session, row.slug)[row.slug], action_selection(config, interface)
+        changes = [f"how versions select actions has changed: {before} → {selection}"] if before != selection else []
+        if changes:
+            change_counter.count(session, "leagues")
+        if row.game_digest != values["game_digest"]:
+            changes.insert(0, _describe_changes(row.game, game))
+            # Also without results: a match of a schedule that is open may still be recorded.
+            earlier = {"game": row.game, "replaced_at": datetime.now(UTC)}
+            upsert(session, EarlierGameRow, {"league": row.slug, "digest": row.game_digest}, earlier)
+        if changes and _has_results(session, row.slug):
+            is_back = _has_results(session, row.slug, Conditions(digest(game), selection))
+            logger.warning(
+                "league %s: %s. %s results can be viewed, but no longer count in ratings, payoffs and verdicts.%s",
+                row.slug,
+                "; ".join(changes),
+                "Later" if is_back else "Earlier",
+                " The results from when the league last had this game count again." if is_back else "",
+            )
+        row.config_document, row.interface_document = values.pop("config"), values.pop("interface")
+        for name, value in values.items():
+            setattr(row, name, value)
 
-    def get(self, league: str) -> LeagueRow:
+    @reading
+    def get(self, session: Session, league: str) -> LeagueRow:
         """Return one league. Raises UnknownLeague."""
-        with self._database.read() as session:
-            return session.get(LeagueRow, league) or _unknown(session, league)
+        return session.get(LeagueRow, league) or _unknown(session, league)
 
-    def earlier_games(self, league: str) -> list[EarlierGameRow]:
+    @reading
+    def earlier_games(self, session: Session, league: str) -> list[EarlierGameRow]:
         """Return the other games that the league had, newest first. Raises UnknownLeague."""
         table = EarlierGameRow
         query = select(table).filter_by(league=league).order_by(table.replaced_at.desc(), table.digest)
-        with self._database.read() as session:
-            row = session.get(LeagueRow, league) or _unknown(session, league)
-            return list(session.scalars(query.where(table.digest != row.game_digest)))
+        row = session.get(LeagueRow, league) or _unknown(session, league)
+        return list(session.scalars(query.where(table.digest != row.game_digest)))
 
     def unregistered_change(self, league: str) -> str | None:
         """Describe how the game of a league has changed since it was registered, whose results still count.
@@ -122,34 +120,34 @@ class LeagueRepository(Repository):
         self.register(row.config, describe(row.config))
         return self.get(league)
 
-    def archive(self, league: str, undo: bool = False) -> LeagueRow:
+    @writing
+    def archive(self, session: Session, league: str, undo: bool = False) -> LeagueRow:
         """Archive a league, or make it active again. Idempotent. Raises UnknownLeague."""
-        with self._database.write() as session:
-            row = lock(session, league)
-            row.archived_at = None if undo else row.archived_at or datetime.now(UTC)
-            return row
+        row = lock(session, league)
+        row.archived_at = None if undo else row.archived_at or datetime.now(UTC)
+        return row
 
-    def names(self) -> dict[str, datetime | None]:
+    @reading
+    def names(self, session: Session) -> dict[str, datetime | None]:
         """Return league → since when it is archived, sorted by name. Does not read configurations."""
         query = select(LeagueRow.slug, LeagueRow.archived_at).order_by(LeagueRow.slug)
-        with self._database.read() as session:
-            return dict(session.execute(query).tuples().all())
+        return dict(session.execute(query).tuples().all())
 
-    def action_selections(self) -> dict[str, ActionSelection]:
+    @reading
+    def action_selections(self, session: Session) -> dict[str, ActionSelection]:
         """Return league → how its versions select actions. Does not read the rest of the configurations."""
-        with self._database.read() as session:
-            return _action_selections(session)
+        return _action_selections(session)
 
-    def policy_ids(self) -> dict[str, tuple[str, ...]]:
+    @reading
+    def policy_ids(self, session: Session) -> dict[str, tuple[str, ...]]:
         """Return league → ids of its policies, sorted by name. Does not read configurations, of which one may be from
         another release. Leaves out leagues whose interface is.
         """
         query = select(LeagueRow.slug, LeagueRow.interface_document).order_by(LeagueRow.slug)
         policy_ids = {}
-        with self._database.read() as session:
-            for league, interface in session.execute(query):
-                with suppress(ValidationError):
-                    policy_ids[league] = Interface.model_validate(interface).policy_ids
+        for league, interface in session.execute(query):
+            with suppress(ValidationError):
+                policy_ids[league] = Interface.model_validate(interface).policy_ids
         return policy_ids
 
 
@@ -159,11 +157,10 @@ def require(session: Session, league: str) -> None:
         _unknown(session, league)
 
 
-def rows(database: Database, league: str, query: Select[Row]) -> list[Row]:
-    """Return the rows of a query about a league, in a transaction of its own. Raises UnknownLeague."""
-    with database.read() as session:
-        require(session, league)
-        return list(session.scalars(query))
+def rows(session: Session, league: str, query: Select[Row]) -> list[Row]:
+    """Return the rows of a query about a league. Raises UnknownLeague."""
+    require(session, league)
+    return list(session.scalars(query))
 
 
 def lock(session: Session, league: str) -> LeagueRow:

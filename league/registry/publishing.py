@@ -4,7 +4,7 @@
             ↘ abandon → files removed → forget                   the version never existed
 
 A row leaves the state `publishing` once, by `finish` or by `abandon`, so files are removed only when the version can no
-longer become ready. A crash at any point leaves a row that `stale` finds later.
+longer become ready. A crash at any point leaves a row that `sweep` finds later.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ from league.files import DISK_FULL_OR_READ_ONLY, disk_errors
 from league.registry import leagues, versions
 from league.registry.processes import has_ended, this_process
 from league.registry.storage.artifacts import ArtifactStore
-from league.registry.storage.database import Database, Repository, row_count
+from league.registry.storage.database import Database, Repository, row_count, writing
 from league.registry.storage.manifest import (
     EXPLOITER,
     MIXTURE,
@@ -81,9 +81,7 @@ class VersionPublisher(Repository):
                     ready = finish(session, manifest, text, source)
             finally:
                 with suppress(StorageError):  # otherwise, a later sweep removes it
-                    with self._database.write() as session:
-                        abandoned = abandon(session, league, number)
-                    if abandoned:
+                    if self._abandon(league, number):
                         self._clear(league, number)
         return self._versions.get(league, ready)
 
@@ -150,15 +148,34 @@ class VersionPublisher(Repository):
 
     def sweep(self, league: str) -> None:
         """Remove what publishers that died have left."""
-        with self._database.write() as session:
-            numbers = stale(session, league)
-        for number in numbers:
+        for number in self._stale(league):
             self._clear(league, number)
 
     def _clear(self, league: str, number: int) -> None:
         self._artifacts.discard(league, number)
-        with self._database.write() as session:
-            forget(session, league, number)
+        self._forget(league, number)
+
+    @writing
+    def _abandon(self, session: Session, league: str, number: int) -> bool:
+        """Give up a reservation. False if it is ready or already abandoned."""
+        return _leave_publishing(session, league, number, {"state": ABANDONED})
+
+    @writing
+    def _forget(self, session: Session, league: str, number: int) -> None:
+        """Delete the row of an abandoned version whose files are removed."""
+        session.execute(delete(VersionTable).filter_by(league=league, number=number, state=ABANDONED))
+
+    @writing
+    def _stale(self, session: Session, league: str) -> list[int]:
+        """Abandon reservations whose publisher is dead; returns the numbers of all abandoned versions."""
+        unfinished = session.scalars(select(VersionTable).filter_by(league=league).where(VersionTable.state != READY))
+        numbers = []
+        for version in unfinished:
+            if version.state == PUBLISHING and not is_dead(version.publisher, version.reserved_at):
+                continue
+            version.state = ABANDONED
+            numbers.append(version.number)
+        return numbers
 
 
 def _without_policies(
@@ -265,28 +282,6 @@ def finish(session: Session, manifest: Manifest, text: str, source: str) -> int:
     if not _leave_publishing(session, manifest.league, manifest.version, values):
         raise StorageError(f"publishing {manifest.league}@{manifest.version} took too long: its files were removed")
     return manifest.version
-
-
-def abandon(session: Session, league: str, number: int) -> bool:
-    """Give up a reservation. False if it is ready or already abandoned."""
-    return _leave_publishing(session, league, number, {"state": ABANDONED})
-
-
-def forget(session: Session, league: str, number: int) -> None:
-    """Delete the row of an abandoned version whose files are removed."""
-    session.execute(delete(VersionTable).filter_by(league=league, number=number, state=ABANDONED))
-
-
-def stale(session: Session, league: str) -> list[int]:
-    """Abandon reservations whose publisher is dead; returns the numbers of all abandoned versions."""
-    unfinished = session.scalars(select(VersionTable).filter_by(league=league).where(VersionTable.state != READY))
-    numbers = []
-    for version in unfinished:
-        if version.state == PUBLISHING and not is_dead(version.publisher, version.reserved_at):
-            continue
-        version.state = ABANDONED
-        numbers.append(version.number)
-    return numbers
 
 
 def is_dead(publisher: str, reserved_at: datetime) -> bool:

@@ -18,7 +18,17 @@ from sqlalchemy.orm import Session
 
 from league.refs import CHAMPION
 from league.registry import leagues, processes, traffic
-from league.registry.storage.database import Repository, clock, insert, row_count, sql_clock, upsert, upsert_all
+from league.registry.storage.database import (
+    Repository,
+    clock,
+    insert,
+    reading,
+    row_count,
+    sql_clock,
+    upsert,
+    upsert_all,
+    writing,
+)
 from league.registry.storage.rows import (
     Acknowledgement,
     AliasEvent,
@@ -86,10 +96,10 @@ class ReplicaRepository(Repository):
             insert(session, ReplicaTable, [{"replica": replica, "process": process, "seen_at": clock(session)}])
         return False
 
-    def registered(self) -> list[RegisteredReplica]:
+    @reading
+    def registered(self, session: Session) -> list[RegisteredReplica]:
         """Return all replicas that have registered and were not removed."""
-        with self._database.read() as session:
-            return _registered(session, true())
+        return _registered(session, true())
 
     def counts(self, silence: timedelta = LIVENESS_TIMEOUT) -> ReplicaCounts:
         """Return how many replicas have registered and were not removed, are silent, and are being stopped.
@@ -102,10 +112,10 @@ class ReplicaRepository(Repository):
         (row,) = self._database.rows(select(func.count(), silent, draining).select_from(ReplicaTable))
         return ReplicaCounts(*row)
 
-    def silent(self, silence: timedelta = LIVENESS_TIMEOUT) -> list[RegisteredReplica]:
+    @reading
+    def silent(self, session: Session, silence: timedelta = LIVENESS_TIMEOUT) -> list[RegisteredReplica]:
         """Return the registered replicas without a report for this time."""
-        with self._database.read() as session:
-            return _registered(session, ReplicaTable.seen_at <= sql_clock(session) - silence)
+        return _registered(session, ReplicaTable.seen_at <= sql_clock(session) - silence)
 
     def remove_ended(self) -> None:
         """Remove the replicas of this machine whose processes have ended without deregistering."""
@@ -150,73 +160,70 @@ class ReplicaRepository(Repository):
                 upsert_all(session, AcknowledgementTable, ("replica", "league"), rows)
             return True
 
-    def acknowledgements(self, league: str) -> list[Acknowledgement]:
+    @reading
+    def acknowledgements(self, session: Session, league: str) -> list[Acknowledgement]:
         """Return what each registered replica serves of a league, by replica. Raises UnknownLeague."""
-        with self._database.read() as session:
-            return acknowledgements(session, league)
+        leagues.require(session, league)
+        current_time = clock(session)
 
-    def write_report(self, replica: str, document: dict[str, Any], counts: Collection[ShadowCounts] = ()) -> None:
+        @cache
+        def state_at(event: int | None, setting: int | None) -> ServedState:
+            """What the registry required when `event` and `setting` were the newest that a replica had read."""
+            if event is None:
+                return ServedState()
+            targets = _aliases_at(session, league, event)
+            aliases = {alias: target.version for alias, target in targets.items()}
+            version = aliases.get(CHAMPION)
+            followed = traffic.setting_at(session, league, setting or 0)
+            pinned = () if followed is None else (followed.canary, followed.shadow)
+            numbers = {str(one.version): one.version for one in pinned if one and isinstance(one.version, int)}
+            return ServedState(
+                version=version,
+                sha256=session.scalar(select(VersionTable.sha256).filter_by(league=league, number=version)),
+                aliases=aliases | numbers,
+                event=max((target.event for target in targets.values()), default=None),
+                traffic=followed.id if followed else None,
+            )
+
+        query = select(ReplicaTable, AcknowledgementTable).select_from(with_acknowledgement(league))
+        return [
+            Acknowledgement(
+                **{name: getattr(row or state_at(replica.event, replica.traffic), name) for name in STATE},
+                replica=replica.replica,
+                league=league,
+                seen_at=replica.seen_at,
+                silence=current_time - replica.seen_at,
+            )
+            for replica, row in session.execute(query.order_by(ReplicaTable.replica))
+        ]
+
+    @writing
+    def write_report(
+        self, session: Session, replica: str, document: dict[str, Any], counts: Collection[ShadowCounts] = ()
+    ) -> None:
         """Replace the metrics report of a replica and its shadow counters since it started."""
-        with self._database.write() as session:
-            values = {"document": document, "at": sql_clock(session)}
-            upsert(session, ReplicaReportTable, {"replica": replica}, values)
-            traffic.write_shadow_counts(session, replica, counts)
+        values = {"document": document, "at": sql_clock(session)}
+        upsert(session, ReplicaReportTable, {"replica": replica}, values)
+        traffic.write_shadow_counts(session, replica, counts)
 
-    def reports(self, since: timedelta = LIVENESS_TIMEOUT) -> dict[str, dict[str, Any]]:
+    @reading
+    def reports(self, session: Session, since: timedelta = LIVENESS_TIMEOUT) -> dict[str, dict[str, Any]]:
         """Return replica → its metrics report, of the replicas that wrote one in the last `since`."""
         table = ReplicaReportTable
-        with self._database.read() as session:
-            query = select(table).where(table.at >= clock(session) - since).order_by(table.replica)
-            return {report.replica: report.document for report in session.scalars(query)}
+        query = select(table).where(table.at >= clock(session) - since).order_by(table.replica)
+        return {report.replica: report.document for report in session.scalars(query)}
 
-    def remove(self, replica: str) -> None:
+    @writing
+    def remove(self, session: Session, replica: str) -> None:
         """Remove a replica that has ended, its acknowledgements and its metrics report, and outdated reports."""
-        with self._database.write() as session:
-            _remove(session, replica)
-            session.execute(delete(ReplicaReportTable).where(ReplicaReportTable.at < clock(session) - KEPT))
+        _remove(session, replica)
+        session.execute(delete(ReplicaReportTable).where(ReplicaReportTable.at < clock(session) - KEPT))
 
     def _update(self, replica: str, values: Mapping[str, Any]) -> bool:
         """Set values of a registered replica, which is alive now. Returns False if it is not registered."""
         if self._database.is_sqlite:
             return self._database.execute(_UPDATE, {"name": replica, "seen_at": datetime.now(UTC), **values}) > 0
         return self._database.execute(_UPDATE_NOW, {"name": replica, **values}) > 0
-
-
-def acknowledgements(session: Session, league: str) -> list[Acknowledgement]:
-    """Return what each registered replica serves of a league, by replica. Raises UnknownLeague."""
-    leagues.require(session, league)
-    current_time = clock(session)
-
-    @cache
-    def state_at(event: int | None, setting: int | None) -> ServedState:
-        """What the registry required when `event` and `setting` were the newest that a replica had read."""
-        if event is None:
-            return ServedState()
-        targets = _aliases_at(session, league, event)
-        aliases = {alias: target.version for alias, target in targets.items()}
-        version = aliases.get(CHAMPION)
-        followed = traffic.setting_at(session, league, setting or 0)
-        pinned = () if followed is None else (followed.canary, followed.shadow)
-        numbers = {str(one.version): one.version for one in pinned if one and isinstance(one.version, int)}
-        return ServedState(
-            version=version,
-            sha256=session.scalar(select(VersionTable.sha256).filter_by(league=league, number=version)),
-            aliases=aliases | numbers,
-            event=max((target.event for target in targets.values()), default=None),
-            traffic=followed.id if followed else None,
-        )
-
-    query = select(ReplicaTable, AcknowledgementTable).select_from(with_acknowledgement(league))
-    return [
-        Acknowledgement(
-            **{name: getattr(row or state_at(replica.event, replica.traffic), name) for name in STATE},
-            replica=replica.replica,
-            league=league,
-            seen_at=replica.seen_at,
-            silence=current_time - replica.seen_at,
-        )
-        for replica, row in session.execute(query.order_by(ReplicaTable.replica))
-    ]
 
 
 def with_acknowledgement(league: str) -> Join:

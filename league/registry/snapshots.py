@@ -10,11 +10,12 @@ from operator import itemgetter
 from typing import Any
 
 from sqlalchemy import Select, func, literal_column, select, union_all
+from sqlalchemy.orm import Session
 
 from league.interface import digest
 from league.refs import CHAMPION
 from league.registry import leagues
-from league.registry.storage.database import Repository, upsert
+from league.registry.storage.database import Repository, reading, upsert, writing
 from league.registry.storage.rows import AliasEvent, LeagueRow, SnapshotRow, VerdictRow
 from league.registry.storage.tables import READY, ScheduleTable, ScheduleTotalTable, VersionTable
 from league.registry.verdicts import VOID
@@ -63,27 +64,28 @@ _REGISTERED = select(
 class SnapshotRepository(Repository):
     """Writes and reads snapshots, and finds outdated ones."""
 
-    def get(self, league: str, part: str) -> SnapshotRow | None:
+    @reading
+    def get(self, session: Session, league: str, part: str) -> SnapshotRow | None:
         """Return a part of a league's snapshots, None if it was not computed yet. Raises UnknownLeague."""
-        with self._database.read() as session:
-            snapshot = session.get(SnapshotRow, (league, part))
-            if snapshot is None:
-                leagues.require(session, league)
-                return None
-            return snapshot
+        snapshot = session.get(SnapshotRow, (league, part))
+        if snapshot is None:
+            leagues.require(session, league)
+            return None
+        return snapshot
 
     def current(self, league: str, part: str) -> SnapshotRow | None:
         """Return a part that was computed from the league's current data, else None. Raises UnknownLeague."""
         snapshot = self.get(league, part)
         return snapshot if snapshot is not None and snapshot.mark == self.current_marks()[league] else None
 
-    def of_part(self, part: str) -> dict[str, SnapshotRow]:
+    @reading
+    def of_part(self, session: Session, part: str) -> dict[str, SnapshotRow]:
         """Return league → this part, of the leagues that have it."""
         query = select(SnapshotRow).filter_by(part=part).order_by(SnapshotRow.league)
-        with self._database.read() as session:
-            return {snapshot.league: snapshot for snapshot in session.scalars(query)}
+        return {snapshot.league: snapshot for snapshot in session.scalars(query)}
 
-    def verdict_reasons(self, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
+    @reading
+    def verdict_reasons(self, session: Session, league: str, verdicts: Collection[str]) -> dict[str, tuple[str, str]]:
         """Return verdict → outcome and reason in its snapshot, of the verdicts that have one.
 
         The rest of the documents, which is long, is not read.
@@ -92,26 +94,25 @@ class SnapshotRepository(Repository):
         fields = (SnapshotRow.document[name].as_string() for name in ("outcome", "reason"))
         query = select(SnapshotRow.part, *fields)
         query = query.where(SnapshotRow.league == league, SnapshotRow.part.in_(parts))
-        with self._database.read() as session:
-            return {parts[part]: (outcome, reason) for part, outcome, reason in session.execute(query)}
+        return {parts[part]: (outcome, reason) for part, outcome, reason in session.execute(query)}
 
-    def marks(self, league: str) -> dict[str, str]:
+    @reading
+    def marks(self, session: Session, league: str) -> dict[str, str]:
         """Return part → the mark that it was computed from, of all parts of a league."""
-        with self._database.read() as session:
-            rows = session.execute(select(SnapshotRow.part, SnapshotRow.mark).filter_by(league=league))
-            return dict(rows.tuples().all())
+        rows = session.execute(select(SnapshotRow.part, SnapshotRow.mark).filter_by(league=league))
+        return dict(rows.tuples().all())
 
-    def put(self, league: str, documents: Mapping[str, Any], mark: str) -> None:
+    @writing
+    def put(self, session: Session, league: str, documents: Mapping[str, Any], mark: str) -> None:
         """Replace these parts of a league's snapshots, all or none. Raises UnknownLeague.
 
         mark: of the data that they were computed from.
         """
         stored_at = datetime.now(UTC)
-        with self._database.write() as session:
-            leagues.require(session, league)
-            for part, document in documents.items():
-                values = {"mark": mark, "document": document, "at": stored_at}
-                upsert(session, SnapshotRow, {"league": league, "part": part}, values)
+        leagues.require(session, league)
+        for part, document in documents.items():
+            values = {"mark": mark, "document": document, "at": stored_at}
+            upsert(session, SnapshotRow, {"league": league, "part": part}, values)
 
     def current_marks(self) -> dict[str, str]:
         """Return league → the mark of its current data, of all leagues."""

@@ -19,7 +19,7 @@ from league.histograms import Histogram
 from league.refs import CHAMPION, CheckpointRef, parse_version
 from league.registry import leagues, versions
 from league.registry.storage import change_counter
-from league.registry.storage.database import Repository, repeat_after_deadlock, upsert
+from league.registry.storage.database import Repository, as_method, reading, upsert, writing
 from league.registry.storage.idempotency import IdempotentCall, apply_once
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic
 from league.registry.storage.tables import ShadowCountTable, TrafficEventTable
@@ -37,12 +37,19 @@ class Unchanged(Enum):
 KEEP = Unchanged.KEEP
 
 
+def current_setting(session: Session, league: str) -> Traffic:
+    """Return the setting in force; without an id if none was ever set. Raises UnknownLeague."""
+    leagues.require(session, league)
+    return setting_at(session, league) or Traffic(league=league)
+
+
 class TrafficRepository(Repository):
     """Sets and reads canaries and shadows."""
 
-    @repeat_after_deadlock
+    @writing
     def set(
         self,
+        session: Session,
         league: str,
         *,
         canary: Portion | Unchanged | None = KEEP,
@@ -57,53 +64,50 @@ class TrafficRepository(Repository):
         returns its setting. Raises UnknownLeague, UnknownVersion, UnknownAlias, NotPromotable, InvalidInput or
         KeyReused.
         """
-        with self._database.write() as session:
-            leagues.lock(session, league)
+        leagues.lock(session, league)
 
-            def change() -> Traffic:
-                setting = current_setting(session, league)
-                new_portions = (
-                    setting.canary if isinstance(canary, Unchanged) else canary,
-                    setting.shadow if isinstance(shadow, Unchanged) else shadow,
-                )
-                for portion in (canary, shadow):
-                    if isinstance(portion, Portion):
-                        _check(session, league, portion)
-                if setting.id is not None and new_portions == (setting.canary, setting.shadow):
-                    return setting
-                change_counter.count(session, "traffic")
-                return _record(session, league, *new_portions, actor=actor, reason=reason)
+        def change() -> Traffic:
+            setting = current_setting(session, league)
+            new_portions = (
+                setting.canary if isinstance(canary, Unchanged) else canary,
+                setting.shadow if isinstance(shadow, Unchanged) else shadow,
+            )
+            for portion in (canary, shadow):
+                if isinstance(portion, Portion):
+                    _check(session, league, portion)
+            if setting.id is not None and new_portions == (setting.canary, setting.shadow):
+                return setting
+            change_counter.count(session, "traffic")
+            return _record(session, league, *new_portions, actor=actor, reason=reason)
 
-            def load(event: int) -> Traffic:
-                return _row(session.get_one(TrafficEventTable, event))
+        def load(event: int) -> Traffic:
+            return _row(session.get_one(TrafficEventTable, event))
 
-            return apply_once(session, call, "traffic", change=change, load=load)
+        return apply_once(session, call, "traffic", change=change, load=load)
 
-    def current(self, league: str) -> Traffic:
-        """Return the setting in force; without an id if none was ever set. Raises UnknownLeague."""
-        with self._database.read() as session:
-            return current_setting(session, league)
+    current = as_method(current_setting)
 
-    def all(self) -> dict[str, Traffic]:
+    @reading
+    def all(self, session: Session) -> dict[str, Traffic]:
         """Return league → its setting in force, of the leagues that have one, by one cheap query."""
         newest = select(func.max(TrafficEventTable.id)).group_by(TrafficEventTable.league)
-        with self._database.read() as session:
-            events = session.scalars(select(TrafficEventTable).where(TrafficEventTable.id.in_(newest)))
-            return {event.league: _row(event) for event in events}
+        events = session.scalars(select(TrafficEventTable).where(TrafficEventTable.id.in_(newest)))
+        return {event.league: _row(event) for event in events}
 
-    def history(self, league: str) -> list[Traffic]:
+    @reading
+    def history(self, session: Session, league: str) -> list[Traffic]:
         """Return all settings of a league, newest first. Raises UnknownLeague."""
         query = select(TrafficEventTable).filter_by(league=league).order_by(TrafficEventTable.id.desc())
-        return [_row(event) for event in leagues.rows(self._database, league, query)]
+        return [_row(event) for event in leagues.rows(session, league, query)]
 
-    def shadow_counts(self, league: str) -> list[ShadowCounts]:
+    @reading
+    def shadow_counts(self, session: Session, league: str) -> list[ShadowCounts]:
         """Return the shadow counters of a league, summed over replicas, by candidate and champion."""
         table = ShadowCountTable
         query = select(table).filter_by(league=league).order_by(table.candidate, table.champion)
         counts_by_pair: dict[tuple[int, int], list[ShadowCountTable]] = {}
-        with self._database.read() as session:
-            for count in session.scalars(query):
-                counts_by_pair.setdefault((count.candidate, count.champion), []).append(count)
+        for count in session.scalars(query):
+            counts_by_pair.setdefault((count.candidate, count.champion), []).append(count)
         return [_sum(league, *pair, counts) for pair, counts in counts_by_pair.items()]
 
 
@@ -136,12 +140,6 @@ def _record(
     session.add(event)
     session.flush()
     return _row(event)
-
-
-def current_setting(session: Session, league: str) -> Traffic:
-    """Return the setting in force; without an id if none was ever set. Raises UnknownLeague."""
-    leagues.require(session, league)
-    return setting_at(session, league) or Traffic(league=league)
 
 
 def setting_at(session: Session, league: str, newest: int | None = None) -> Traffic | None:

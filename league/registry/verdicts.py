@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from league.errors import Conflict, InvalidInput, InvalidReference, UnknownVerdict
 from league.refs import SHORT_VERDICT, VERDICT, verdict_digest
 from league.registry import leagues, versions
-from league.registry.storage.database import Repository, insert, repeat_after_deadlock
+from league.registry.storage.database import Repository, insert, reading, writing
 from league.registry.storage.rows import AliasEvent, NightlyRunRow, VerdictRow
 
 VOID = "void"
@@ -25,73 +25,72 @@ MAX_LISTED = 5
 class VerdictRepository(Repository):
     """Opens, closes, voids and reads verdicts."""
 
-    @repeat_after_deadlock
-    def open(self, league: str, candidate: int, champion: str, schedule: str, settings: dict[str, Any]) -> VerdictRow:
+    @writing
+    def open(
+        self, session: Session, league: str, candidate: int, champion: str, schedule: str, settings: dict[str, Any]
+    ) -> VerdictRow:
         """Open the verdict that counts the matches of `schedule`, or return it if it exists. Its id is the schedule's.
 
         Raises UnknownVersion, or Conflict if it exists with other arguments.
         """
         values = {"league": league, "candidate": candidate, "champion": champion, "settings": settings}
-        with self._database.write() as session:
-            versions.require(session, league, candidate)
-            insert(session, VerdictRow, [values | {"id": schedule, "opened_at": datetime.now(UTC)}])
-            verdict = session.get_one(VerdictRow, schedule)
-            for name, value in values.items():
-                if (stored_value := getattr(verdict, name)) != value:
-                    raise Conflict(f"verdict {schedule} was opened with {name} {stored_value!r}, not {value!r}")
-            return verdict
+        versions.require(session, league, candidate)
+        insert(session, VerdictRow, [values | {"id": schedule, "opened_at": datetime.now(UTC)}])
+        verdict = session.get_one(VerdictRow, schedule)
+        for name, value in values.items():
+            if (stored_value := getattr(verdict, name)) != value:
+                raise Conflict(f"verdict {schedule} was opened with {name} {stored_value!r}, not {value!r}")
+        return verdict
 
-    @repeat_after_deadlock
-    def settle(self, verdict: str, test: dict[str, Any]) -> VerdictRow:
+    @writing
+    def settle(self, session: Session, verdict: str, test: dict[str, Any]) -> VerdictRow:
         """Record the schedule of a test whose opponents are trained now, and return the verdict.
 
         A closed verdict, and a test that has a schedule, stay as they are. Raises UnknownVerdict.
         test: its record, in place of that of the same kind.
         """
-        with self._database.write() as session:
-            row = _locked(session, verdict)
-            if row.outcome is None:
-                tests = [
-                    test if (record["kind"], record["schedule"]) == (test["kind"], None) else record
-                    for record in row.settings["tests"]
-                ]
-                row.settings = row.settings | {"tests": tests}
-            return row
+        row = _locked(session, verdict)
+        if row.outcome is None:
+            tests = [
+                test if (record["kind"], record["schedule"]) == (test["kind"], None) else record
+                for record in row.settings["tests"]
+            ]
+            row.settings = row.settings | {"tests": tests}
+        return row
 
-    @repeat_after_deadlock
-    def close(self, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
+    @writing
+    def close(self, session: Session, verdict: str, outcome: str, evidence: dict[str, Any]) -> None:
         """Record the outcome of a verdict. Idempotent. Raises UnknownVerdict, or Conflict if it has another outcome."""
-        with self._database.write() as session:
-            row = _locked(session, verdict)
-            if row.outcome is None:
-                row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
-            elif row.outcome != outcome:
-                raise Conflict(f"verdict {verdict} is already {row.outcome!r}, it cannot become {outcome!r}")
+        row = _locked(session, verdict)
+        if row.outcome is None:
+            row.outcome, row.evidence, row.closed_at = outcome, evidence, datetime.now(UTC)
+        elif row.outcome != outcome:
+            raise Conflict(f"verdict {verdict} is already {row.outcome!r}, it cannot become {outcome!r}")
 
-    @repeat_after_deadlock
-    def void(self, verdict: str, note: str) -> VerdictRow:
+    @writing
+    def void(self, session: Session, verdict: str, note: str) -> VerdictRow:
         """Void a verdict, open or closed. Idempotent.
 
         Its evidence is kept and its alpha stays spent. A promotion that it led to is not undone.
         Raises UnknownVerdict, or Conflict while its promotion is being applied.
         """
-        with self._database.write() as session:
-            row = _locked(session, verdict)
-            if row.outcome is None:
-                leagues.lock(session, row.league)
-                if session.scalars(select(AliasEvent).filter_by(verdict=verdict)).first() is not None:
-                    raise Conflict(f"the promotion of verdict {verdict} is being applied: void it once it is closed")
-            if row.outcome != VOID:
-                row.outcome, row.evidence = VOID, {**(row.evidence or {}), "note": note}
-                row.closed_at = row.closed_at or datetime.now(UTC)
-            return row
+        row = _locked(session, verdict)
+        if row.outcome is None:
+            leagues.lock(session, row.league)
+            if session.scalars(select(AliasEvent).filter_by(verdict=verdict)).first() is not None:
+                raise Conflict(f"the promotion of verdict {verdict} is being applied: void it once it is closed")
+        if row.outcome != VOID:
+            row.outcome, row.evidence = VOID, {**(row.evidence or {}), "note": note}
+            row.closed_at = row.closed_at or datetime.now(UTC)
+        return row
 
-    def get(self, verdict: str) -> VerdictRow:
+    @reading
+    def get(self, session: Session, verdict: str) -> VerdictRow:
         """Return one verdict. Raises UnknownVerdict."""
-        with self._database.read() as session:
-            return session.get(VerdictRow, verdict) or _unknown(verdict)
+        return session.get(VerdictRow, verdict) or _unknown(verdict)
 
-    def find(self, text: str, league: str | None = None) -> VerdictRow:
+    @reading
+    def find(self, session: Session, text: str, league: str | None = None) -> VerdictRow:
         """Return the verdict with this id, or the only one whose id or digest begins with it.
 
         league: search the verdicts of this league only.
@@ -100,12 +99,11 @@ class VerdictRepository(Repository):
         """
         table = VerdictRow
         begins = table.id.startswith(text, autoescape=True) | table.id.contains(VERDICT + text, autoescape=True)
-        with self._database.read() as session:
-            if league is not None:
-                leagues.require(session, league)
-            if (exact := session.get(table, text)) is not None and league in (None, exact.league):
-                return exact
-            rows = list(session.scalars(select(table).where(begins).order_by(table.id)))
+        if league is not None:
+            leagues.require(session, league)
+        if (exact := session.get(table, text)) is not None and league in (None, exact.league):
+            return exact
+        rows = list(session.scalars(select(table).where(begins).order_by(table.id)))
         verdicts = [
             row
             for row in rows
@@ -117,12 +115,14 @@ class VerdictRepository(Repository):
             raise InvalidReference(f"verdict {text!r} is ambiguous: {_candidates(verdicts)}")
         return verdicts[0]
 
-    def all(self, league: str) -> list[VerdictRow]:
+    @reading
+    def all(self, session: Session, league: str) -> list[VerdictRow]:
         """Return all verdicts of a league in the order in which they were opened. Raises UnknownLeague."""
         query = select(VerdictRow).filter_by(league=league).order_by(VerdictRow.opened_at, VerdictRow.id)
-        return leagues.rows(self._database, league, query)
+        return leagues.rows(session, league, query)
 
-    def newest(self, league: str, *, before: str | None = None, limit: int = 20) -> list[VerdictRow]:
+    @reading
+    def newest(self, session: Session, league: str, *, before: str | None = None, limit: int = 20) -> list[VerdictRow]:
         """Return at most `limit` verdicts of a league, newest first.
 
         before: return only verdicts opened before this one.
@@ -130,61 +130,59 @@ class VerdictRepository(Repository):
         """
         table = VerdictRow
         query = select(table).filter_by(league=league).order_by(table.opened_at.desc(), table.id.desc()).limit(limit)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            if before is not None:
-                last = session.get(table, before)
-                if last is None or last.league != league:
-                    raise InvalidInput(f"before: league {league} has no verdict {before!r}")
-                query = query.where(tuple_(table.opened_at, table.id) < (last.opened_at, last.id))
-            return list(session.scalars(query))
+        leagues.require(session, league)
+        if before is not None:
+            last = session.get(table, before)
+            if last is None or last.league != league:
+                raise InvalidInput(f"before: league {league} has no verdict {before!r}")
+            query = query.where(tuple_(table.opened_at, table.id) < (last.opened_at, last.id))
+        return list(session.scalars(query))
 
-    def last_closed(self) -> dict[str, VerdictRow]:
+    @reading
+    def last_closed(self, session: Session) -> dict[str, VerdictRow]:
         """Return league → the verdict that was closed last, of the leagues that have one."""
         table = VerdictRow
         closed = select(table).where(table.closed_at.is_not(None)).order_by(table.closed_at, table.id)
         latest = select(table.league, func.max(table.closed_at).label("at")).group_by(table.league).subquery()
         is_latest = (table.league == latest.c.league) & (table.closed_at == latest.c.at)
-        with self._database.read() as session:
-            return {verdict.league: verdict for verdict in session.scalars(closed.join(latest, is_latest))}
+        return {verdict.league: verdict for verdict in session.scalars(closed.join(latest, is_latest))}
 
 
 class NightlyRunRepository(Repository):
     """Opens, closes and reads nightly runs."""
 
-    @repeat_after_deadlock
-    def open(self, league: str, candidates: Collection[int], alpha: float) -> NightlyRunRow:
+    @writing
+    def open(self, session: Session, league: str, candidates: Collection[int], alpha: float) -> NightlyRunRow:
         """Open a nightly run that judges `candidates`, or return the one that is open. Raises UnknownLeague."""
-        with self._database.write() as session:
-            leagues.lock(session, league)
-            run = session.scalars(select(NightlyRunRow).filter_by(league=league, ended_at=None)).first()
-            if run is None:
-                began_at = datetime.now(UTC)
-                run = NightlyRunRow(league=league, candidates=tuple(sorted(candidates)), alpha=alpha, began_at=began_at)
-                session.add(run)
-                session.flush()
-            return run
+        leagues.lock(session, league)
+        run = session.scalars(select(NightlyRunRow).filter_by(league=league, ended_at=None)).first()
+        if run is None:
+            began_at = datetime.now(UTC)
+            run = NightlyRunRow(league=league, candidates=tuple(sorted(candidates)), alpha=alpha, began_at=began_at)
+            session.add(run)
+            session.flush()
+        return run
 
-    @repeat_after_deadlock
-    def close(self, run: int, report: dict[str, Any] | None) -> None:
+    @writing
+    def close(self, session: Session, run: int, report: dict[str, Any] | None) -> None:
         """End a nightly run and store its report. Idempotent."""
-        with self._database.write() as session:
-            row = session.get_one(NightlyRunRow, run)
-            if row.ended_at is None:
-                row.report, row.ended_at = report, datetime.now(UTC)
+        row = session.get_one(NightlyRunRow, run)
+        if row.ended_at is None:
+            row.report, row.ended_at = report, datetime.now(UTC)
 
-    def last_ended(self) -> dict[str, datetime]:
+    @reading
+    def last_ended(self, session: Session) -> dict[str, datetime]:
         """Return league → when its last nightly run ended, of the leagues that have had one."""
         table = NightlyRunRow
         query = select(table.league, func.max(table.ended_at)).where(table.ended_at.is_not(None))
-        with self._database.read() as session:
-            rows = session.execute(query.group_by(table.league)).tuples()
-            return {league: ended_at for league, ended_at in rows if ended_at is not None}
+        rows = session.execute(query.group_by(table.league)).tuples()
+        return {league: ended_at for league, ended_at in rows if ended_at is not None}
 
-    def all(self, league: str) -> list[NightlyRunRow]:
+    @reading
+    def all(self, session: Session, league: str) -> list[NightlyRunRow]:
         """Return all nightly runs of a league, oldest first. Raises UnknownLeague."""
         query = select(NightlyRunRow).filter_by(league=league).order_by(NightlyRunRow.id)
-        return leagues.rows(self._database, league, query)
+        return leagues.rows(session, league, query)
 
 
 def require_open(session: Session, verdict: str) -> None:

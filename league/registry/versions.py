@@ -11,7 +11,7 @@ from league.errors import InvalidInput, NotPromotable, UnknownAlias, UnknownVers
 from league.refs import CheckpointRef
 from league.registry import leagues
 from league.registry.storage.artifacts import ArtifactStore
-from league.registry.storage.database import Database, Repository
+from league.registry.storage.database import Database, Repository, as_method, reading, writing
 from league.registry.storage.manifest import (
     EXPLOITER,
     MIXTURE,
@@ -29,6 +29,47 @@ MAX_NOTE_LENGTH = 2000
 """Characters."""
 
 
+def _get(session: Session, league: str, number: int) -> VersionRow:
+    """Return one version. Raises UnknownLeague or UnknownVersion."""
+    version = session.scalar(_ready(league).where(VersionTable.number == number))
+    return _rows(session, league, [version])[0] if version else _unknown(session, league, number)
+
+
+def resolve(session: Session, ref: CheckpointRef | str) -> VersionRow:
+    """Return the version that a reference names now.
+
+    Raises InvalidReference, UnknownLeague, UnknownVersion or UnknownAlias.
+    """
+    ref = CheckpointRef.parse(ref) if isinstance(ref, str) else ref
+    if isinstance(ref.version, int):
+        return _get(session, ref.league, ref.version)
+    number = session.scalar(select(AliasTable.version).filter_by(league=ref.league, name=ref.version))
+    if number is None:
+        leagues.require(session, ref.league)
+        names = session.scalars(select(AliasTable.name).filter_by(league=ref.league).order_by(AliasTable.name))
+        known_names = ", ".join(names) or "none yet"
+        raise UnknownAlias(f"league {ref.league} has no alias {ref.version!r}; known: {known_names}")
+    return _get(session, ref.league, number)
+
+
+def mixtures(session: Session, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
+    """Return the mixtures among some versions, by one cheap query."""
+    manifests = _manifests(session, league, MIXTURE, numbers)
+    return {number: manifest.mixture for number, manifest in manifests if manifest.mixture is not None}
+
+
+def searches(session: Session, league: str, numbers: Collection[int]) -> dict[int, SearchSettings]:
+    """Return the searches of the search versions among some versions."""
+    manifests = _manifests(session, league, SEARCH, numbers)
+    return {number: manifest.search for number, manifest in manifests if manifest.search is not None}
+
+
+def players(session: Session, league: str, numbers: Collection[int]) -> dict[int, tuple[int, ...]]:
+    """Return the members of the mixtures among some versions, and what the search versions among them play."""
+    of_mixtures = {number: mixture.versions for number, mixture in mixtures(session, league, numbers).items()}
+    return of_mixtures | {number: (search.version,) for number, search in searches(session, league, numbers).items()}
+
+
 class VersionRepository(Repository):
     """Reads published versions and their files, and writes notes."""
 
@@ -36,10 +77,11 @@ class VersionRepository(Repository):
         super().__init__(database)
         self._artifacts = artifacts
 
-    def get(self, league: str, number: int) -> VersionRow:
-        """Return one version. Raises UnknownLeague or UnknownVersion."""
-        with self._database.read() as session:
-            return _get(session, league, number)
+    get = as_method(_get)
+    resolve = as_method(resolve)
+    mixtures = as_method(mixtures)
+    searches = as_method(searches)
+    players = as_method(players)
 
     def with_files(self, ref: CheckpointRef) -> VersionRow:
         """Return the version that a reference names now. Raises VersionRetired, and what `resolve` raises."""
@@ -47,15 +89,6 @@ class VersionRepository(Repository):
         if version.retired_at is not None:
             _retired(version.league, version.number)
         return version
-
-    def resolve(self, ref: CheckpointRef | str) -> VersionRow:
-        """Return the version that a reference names now.
-
-        Raises InvalidReference, UnknownLeague, UnknownVersion or UnknownAlias.
-        """
-        ref = CheckpointRef.parse(ref) if isinstance(ref, str) else ref
-        with self._database.read() as session:
-            return resolve(session, ref)
 
     def all(self, league: str) -> list[VersionRow]:
         """Return all versions of a league, oldest first. Raises UnknownLeague."""
@@ -76,18 +109,18 @@ class VersionRepository(Repository):
         query = _ready(league).where(VersionTable.exploits.in_(targets), VersionTable.retired_at.is_(None))
         return self._list(league, query.order_by(VersionTable.number))
 
-    def _list(self, league: str, query: Select[VersionTable]) -> list[VersionRow]:
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return _rows(session, league, list(session.scalars(query)))
+    @reading
+    def _list(self, session: Session, league: str, query: Select[VersionTable]) -> list[VersionRow]:
+        return _rows(session, league, leagues.rows(session, league, query))
 
-    def exploiter_refs(self, league: str) -> set[str]:
+    @reading
+    def exploiter_refs(self, session: Session, league: str) -> set[str]:
         """Return the references of all exploiters of a league, retired ones included. Does not read manifests."""
         query = select(VersionTable.number).where(VersionTable.league == league, VersionTable.exploits.is_not(None))
-        with self._database.read() as session:
-            return {f"{league}@{number}" for number in session.scalars(query)}
+        return {f"{league}@{number}" for number in session.scalars(query)}
 
-    def numbers(self, league: str | None = None) -> dict[str, list[int]]:
+    @reading
+    def numbers(self, session: Session, league: str | None = None) -> dict[str, list[int]]:
         """Return league → version numbers, ascending, of one league or of all that have versions.
 
         Retired versions are not included. Does not read manifests.
@@ -99,9 +132,8 @@ class VersionRepository(Repository):
             .order_by(table.league, table.number)
         )
         numbers: dict[str, list[int]] = {}
-        with self._database.read() as session:
-            for name, number in session.execute(query if league is None else query.filter_by(league=league)):
-                numbers.setdefault(name, []).append(number)
+        for name, number in session.execute(query if league is None else query.filter_by(league=league)):
+            numbers.setdefault(name, []).append(number)
         return numbers
 
     def states(self, keys: Collection[tuple[str, int]]) -> dict[tuple[str, int], VersionState | None]:
@@ -112,22 +144,6 @@ class VersionRepository(Repository):
         query = query.where(table.number.in_({number for _, number in keys}))
         states = {(league, number): VersionState(*state) for league, number, *state in self._database.rows(query)}
         return {key: states.get(key) for key in keys}
-
-    def mixtures(self, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
-        """Return the mixtures among some versions, by one cheap query."""
-        with self._database.read() as session:
-            return mixtures(session, league, numbers)
-
-    def searches(self, league: str, numbers: Collection[int]) -> dict[int, SearchSettings]:
-        """Return the searches of the search versions among some versions."""
-        with self._database.read() as session:
-            return searches(session, league, numbers)
-
-    def players(self, league: str, numbers: Collection[int]) -> dict[int, tuple[int, ...]]:
-        """Return the versions whose policies play, of those among some versions that have none: the members of a
-        mixture, and the version that a search version plays."""
-        with self._database.read() as session:
-            return players(session, league, numbers)
 
     def fetch(self, league: str, number: int) -> Path:
         """Return a local directory with the verified files of a version. Raises ArtifactCorrupt or VersionRetired."""
@@ -148,7 +164,8 @@ class VersionRepository(Repository):
         """Return whether a version has the training state from which training continues."""
         return version.retired_at is None and self._artifacts.has_folder(version.league, version.number, TRAINING)
 
-    def set_note(self, ref: CheckpointRef, text: str, *, actor: str) -> VersionRow:
+    @writing
+    def set_note(self, session: Session, ref: CheckpointRef, text: str, *, actor: str) -> VersionRow:
         """Replace the note of a version; an empty text removes it.
 
         Raises UnknownLeague, UnknownVersion, UnknownAlias or InvalidInput.
@@ -158,28 +175,14 @@ class VersionRepository(Repository):
             raise InvalidInput(
                 f"a note must be at most {MAX_NOTE_LENGTH} characters without a zero byte, got {len(text)}"
             )
-        with self._database.write() as session:
-            version = resolve(session, ref)
-            if text != (version.note.text if version.note else ""):
-                note = VersionNoteTable(
-                    league=version.league, version=version.number, text=text, actor=actor, at=datetime.now(UTC)
-                )
-                session.add(note)
-                session.flush()
-            return _get(session, version.league, version.number)
-
-
-def resolve(session: Session, ref: CheckpointRef) -> VersionRow:
-    """Return the version that a reference names now. Raises UnknownLeague, UnknownVersion or UnknownAlias."""
-    if isinstance(ref.version, int):
-        return _get(session, ref.league, ref.version)
-    number = session.scalar(select(AliasTable.version).filter_by(league=ref.league, name=ref.version))
-    if number is None:
-        leagues.require(session, ref.league)
-        names = session.scalars(select(AliasTable.name).filter_by(league=ref.league).order_by(AliasTable.name))
-        known_names = ", ".join(names) or "none yet"
-        raise UnknownAlias(f"league {ref.league} has no alias {ref.version!r}; known: {known_names}")
-    return _get(session, ref.league, number)
+        version = resolve(session, ref)
+        if text != (version.note.text if version.note else ""):
+            note = VersionNoteTable(
+                league=version.league, version=version.number, text=text, actor=actor, at=datetime.now(UTC)
+            )
+            session.add(note)
+            session.flush()
+        return _get(session, version.league, version.number)
 
 
 def find_by_source(session: Session, league: str, source: str) -> int | None:
@@ -214,24 +217,6 @@ def require_promotable(session: Session, league: str, number: int) -> None:
         )
 
 
-def mixtures(session: Session, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
-    """Return the mixtures among some versions."""
-    manifests = _manifests(session, league, MIXTURE, numbers)
-    return {number: manifest.mixture for number, manifest in manifests if manifest.mixture is not None}
-
-
-def searches(session: Session, league: str, numbers: Collection[int]) -> dict[int, SearchSettings]:
-    """Return the searches of the search versions among some versions."""
-    manifests = _manifests(session, league, SEARCH, numbers)
-    return {number: manifest.search for number, manifest in manifests if manifest.search is not None}
-
-
-def players(session: Session, league: str, numbers: Collection[int]) -> dict[int, tuple[int, ...]]:
-    """Return the members of the mixtures among some versions, and what the search versions among them play."""
-    of_mixtures = {number: mixture.versions for number, mixture in mixtures(session, league, numbers).items()}
-    return of_mixtures | {number: (search.version,) for number, search in searches(session, league, numbers).items()}
-
-
 def members(session: Session, league: str, numbers: Collection[int]) -> set[int]:
     """Return all versions that `players` returns."""
     return {number for versions in players(session, league, numbers).values() for number in versions}
@@ -246,11 +231,6 @@ def _manifests(session: Session, league: str, role: Role, numbers: Collection[in
 
 def _retired(league: str, number: int) -> None:
     raise VersionRetired(f"{league}@{number} was retired and its files were removed: use another version")
-
-
-def _get(session: Session, league: str, number: int) -> VersionRow:
-    version = session.scalar(_ready(league).where(VersionTable.number == number))
-    return _rows(session, league, [version])[0] if version else _unknown(session, league, number)
 
 
 def _ready(league: str) -> Select[VersionTable]:

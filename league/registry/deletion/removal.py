@@ -26,7 +26,7 @@ from league.registry import evaluations, leagues, traffic, versions
 from league.registry.publishing import VersionPublisher
 from league.registry.storage import change_counter
 from league.registry.storage.artifacts import ArtifactStore
-from league.registry.storage.database import Database, Repository
+from league.registry.storage.database import Database, Repository, reading
 from league.registry.storage.manifest import MIXTURE, SEARCH
 from league.registry.storage.rows import (
     AliasEvent,
@@ -108,12 +108,12 @@ class RemovalRepository(Repository):
         self._artifacts, self._home = artifacts, home
         self._publisher = VersionPublisher(database, artifacts)
 
-    def plan_version(self, ref: CheckpointRef) -> RemovalPlan:
+    @reading
+    def plan_version(self, session: Session, ref: CheckpointRef) -> RemovalPlan:
         """Return what the removal of a version removes. Raises UnknownLeague, UnknownVersion or UnknownAlias."""
-        with self._database.read() as session:
-            version = versions.resolve(session, ref)
-            dependents = _dependents_of_version(session, version.league, version.number)
-            matches = _count_matches(session, _matches_of(version.ref, dependents))
+        version = versions.resolve(session, ref)
+        dependents = _dependents_of_version(session, version.league, version.number)
+        matches = _count_matches(session, _matches_of(version.ref, dependents))
         return RemovalPlan(
             version.ref,
             {version.number: self._artifacts.size(version.league, version.number)},
@@ -123,18 +123,16 @@ class RemovalRepository(Repository):
             reasons=tuple(dependents.reasons),
         )
 
-    def plan_league(self, league: str) -> RemovalPlan:
+    @reading
+    def plan_league(self, session: Session, league: str) -> RemovalPlan:
         """Return what the removal of a league removes. Raises UnknownLeague."""
-        with self._database.read() as session:
-            leagues.require(session, league)
-            numbers = session.scalars(
-                select(VersionTable.number).filter_by(league=league).order_by(VersionTable.number)
-            )
-            sizes = {number: self._artifacts.size(league, number) for number in numbers}
-            aliases = _names(session, AliasTable.name, league)
-            verdicts = _names(session, VerdictRow.id, league)
-            run_ids = _names(session, RunRow.id, league)
-            matches = _count_matches(session, MatchTable.league == league)
+        leagues.require(session, league)
+        numbers = session.scalars(select(VersionTable.number).filter_by(league=league).order_by(VersionTable.number))
+        sizes = {number: self._artifacts.size(league, number) for number in numbers}
+        aliases = _names(session, AliasTable.name, league)
+        verdicts = _names(session, VerdictRow.id, league)
+        run_ids = _names(session, RunRow.id, league)
+        matches = _count_matches(session, MatchTable.league == league)
         reasons = [
             *(f"the alias {name} is set" for name in aliases),
             *_counted(len(verdicts), "verdict", map(short_verdict, verdicts)),

@@ -22,7 +22,7 @@ from league.refs import CheckpointRef, parse_ref
 from league.registry import leagues, traffic, versions
 from league.registry.storage import change_counter
 from league.registry.storage.artifacts import ArtifactStore
-from league.registry.storage.database import Database, Repository
+from league.registry.storage.database import Database, Repository, reading
 from league.registry.storage.manifest import MIXTURE, SEARCH
 from league.registry.storage.rows import AliasEvent, NightlyRunRow, VerdictRow
 from league.registry.storage.tables import READY, AliasTable, ScheduleTable, VersionTable
@@ -53,11 +53,11 @@ class RetentionRepository(Repository):
         super().__init__(database)
         self._artifacts = artifacts
 
-    def plan(self, league: str, *, keep: int, before: datetime) -> Removal:
+    @reading
+    def plan(self, session: Session, league: str, *, keep: int, before: datetime) -> Removal:
         """Return what `retire` would remove. Raises UnknownLeague."""
-        with self._database.read() as session:
-            leagues.require(session, league)
-            return self._removal(league, *_candidates(session, league, keep, before))
+        leagues.require(session, league)
+        return self._removal(league, *_candidates(session, league, keep, before))
 
     def retire(self, league: str, *, keep: int, before: datetime) -> Removal:
         """Retire versions and remove files. Returns what was removed.

@@ -12,9 +12,10 @@ from contextvars import ContextVar
 from datetime import UTC, datetime
 from functools import wraps
 from importlib import import_module
+from inspect import Parameter, signature
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 from urllib.parse import quote
 
 from filelock import FileLock
@@ -136,6 +137,7 @@ STORAGE_ERRORS = (OperationalError, DatabaseError, InterfaceError, InternalError
 
 P = ParamSpec("P")
 T = TypeVar("T")
+R = TypeVar("R", bound="Repository")
 
 
 class Deadlock(StorageError):
@@ -191,7 +193,8 @@ class Database:
             session.begin(),
         ):
             if deadline is not None and self.engine.dialect.name == "postgresql":
-                session.execute(text(f"SET LOCAL lock_timeout = {_milliseconds_until(deadline)}"))
+                # Like SQLite's timeout, with the first statement: until then, the database is not used.
+                event.listen(session, "after_begin", lambda *begun: _limit_waiting(begun[-1], deadline))
             yield session
             if deadline is not None:
                 _milliseconds_until(deadline)
@@ -250,6 +253,10 @@ def before(deadline: float) -> Iterator[None]:
         _deadline.reset(token)
 
 
+def _limit_waiting(connection: Connection, deadline: float) -> None:
+    connection.exec_driver_sql(f"SET LOCAL lock_timeout = {_milliseconds_until(deadline)}")
+
+
 def _milliseconds_until(deadline: float) -> int:
     if (seconds := deadline - time.monotonic()) <= 0:
         raise DeadlineExceeded("the database was busy until the deadline: nothing was changed")
@@ -257,10 +264,65 @@ def _milliseconds_until(deadline: float) -> int:
 
 
 class Repository:
-    """Base of the repositories. Each public method is one transaction."""
+    """Base of the repositories. Each public method is one transaction: `reading`, `writing` or `as_method`."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
+
+
+def reading(method: Callable[Concatenate[R, Session, P], T]) -> Callable[Concatenate[R, P], T]:
+    """Call a method of a repository with the session of a read-only transaction, which is its first argument."""
+
+    @wraps(method)
+    def call(self: R, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        with self._database.read() as session:
+            return method(self, session, *args, **kwargs)
+
+    return _as_callers_see(call)
+
+
+def writing(method: Callable[Concatenate[R, Session, P], T]) -> Callable[Concatenate[R, P], T]:
+    """Call a method of a repository with the session of a write transaction, which is its first argument.
+
+    The transaction begins with the method's first statement: what precedes it holds no lock, and an invalid argument is
+    reported even if the database cannot be reached.
+
+    If PostgreSQL has ended the transaction to resolve a deadlock, the method is called once more. The other transaction
+    gets DEADLOCK_PAUSE to take the locks that this one has lost. Without it, both could end in the same deadlock again.
+    """
+
+    def attempt(self: R, *args: P.args, **kwargs: P.kwargs) -> T:
+        with self._database.write() as session:
+            return method(self, session, *args, **kwargs)
+
+    @wraps(method)
+    def call(self: R, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return attempt(self, *args, **kwargs)
+        except Deadlock:
+            time.sleep(DEADLOCK_PAUSE)
+            return attempt(self, *args, **kwargs)
+
+    return _as_callers_see(call)
+
+
+def as_method(function: Callable[Concatenate[Session, P], T]) -> Callable[Concatenate[Repository, P], T]:
+    """Return a method that is `reading`, of a function that is also a part of other transactions."""
+
+    @wraps(function)
+    def call(_: Repository, session: Session, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return function(session, *args, **kwargs)
+
+    return reading(call)
+
+
+def _as_callers_see(call: Callable[P, T]) -> Callable[P, T]:
+    """Give a method the signature without the session, for `help`."""
+    original = signature(call)
+    parameters = list(original.parameters.values())[list(original.parameters).index("session") + 1 :]
+    of_method = [Parameter("self", Parameter.POSITIONAL_ONLY), *parameters]
+    vars(call)["__signature__"] = original.replace(parameters=of_method)
+    return call
 
 
 def insert(session: Session, table: type[Base], rows: Sequence[Mapping[str, Any]]) -> int:
@@ -337,24 +399,6 @@ def translate_errors(engine: Engine) -> Iterator[None]:
             reason = full_disk(Path(engine.url.database or "")) or reason
         kind = Deadlock if getattr(error.orig, "sqlstate", None) in DEADLOCKS else StorageError
         raise kind(f"the database {where} cannot be used: {reason}") from error
-
-
-def repeat_after_deadlock(method: Callable[P, T]) -> Callable[P, T]:
-    """Call a method, which is one transaction, once more if PostgreSQL has ended it to resolve a deadlock.
-
-    The other transaction gets DEADLOCK_PAUSE to take the locks that this one has lost. Without it, both could end in
-    the same deadlock again.
-    """
-
-    @wraps(method)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        try:
-            return method(*args, **kwargs)
-        except Deadlock:
-            time.sleep(DEADLOCK_PAUSE)
-            return method(*args, **kwargs)
-
-    return call
 
 
 def _engine(url: str, create: bool, listens: bool) -> Engine:

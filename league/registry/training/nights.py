@@ -8,10 +8,11 @@ from datetime import UTC, datetime
 from typing import Any
 
 from sqlalchemy import func, select
+from sqlalchemy.orm import Session
 
 from league.refs import CHAMPION
 from league.registry import leagues
-from league.registry.storage.database import Repository, repeat_after_deadlock
+from league.registry.storage.database import Repository, reading, writing
 from league.registry.storage.manifest import MAIN
 from league.registry.storage.rows import TrainingNightRow
 from league.registry.storage.tables import READY, AliasTable, VersionTable
@@ -20,48 +21,46 @@ from league.registry.storage.tables import READY, AliasTable, VersionTable
 class TrainingNightRepository(Repository):
     """Opens, records, closes and reads nights of training."""
 
-    @repeat_after_deadlock
-    def open(self, league: str) -> TrainingNightRow:
+    @writing
+    def open(self, session: Session, league: str) -> TrainingNightRow:
         """Open a night, or return the one that is open. Raises UnknownLeague.
 
         Its training continues from the champion, or else from the newest version with the role `main`.
         """
-        with self._database.write() as session:
-            leagues.lock(session, league)
-            night = session.scalars(select(TrainingNightRow).filter_by(league=league, ended_at=None)).first()
-            if night is None:
-                champion = select(AliasTable.version).filter_by(league=league, name=CHAMPION)
-                table = VersionTable
-                newest = select(table.number).filter_by(league=league, state=READY, role=MAIN, retired_at=None)
-                earlier = session.scalar(select(func.count()).select_from(TrainingNightRow).filter_by(league=league))
-                night = TrainingNightRow(
-                    number=(earlier or 0) + 1,
-                    league=league,
-                    parent=session.scalar(champion) or session.scalar(newest.order_by(table.number.desc()).limit(1)),
-                    steps={},
-                    began_at=datetime.now(UTC),
-                )
-                session.add(night)
-                session.flush()
-            return night
+        leagues.lock(session, league)
+        night = session.scalars(select(TrainingNightRow).filter_by(league=league, ended_at=None)).first()
+        if night is None:
+            champion = select(AliasTable.version).filter_by(league=league, name=CHAMPION)
+            table = VersionTable
+            newest = select(table.number).filter_by(league=league, state=READY, role=MAIN, retired_at=None)
+            earlier = session.scalar(select(func.count()).select_from(TrainingNightRow).filter_by(league=league))
+            night = TrainingNightRow(
+                number=(earlier or 0) + 1,
+                league=league,
+                parent=session.scalar(champion) or session.scalar(newest.order_by(table.number.desc()).limit(1)),
+                steps={},
+                began_at=datetime.now(UTC),
+            )
+            session.add(night)
+            session.flush()
+        return night
 
-    @repeat_after_deadlock
-    def record(self, night: int, step: str, result: dict[str, Any]) -> TrainingNightRow:
+    @writing
+    def record(self, session: Session, night: int, step: str, result: dict[str, Any]) -> TrainingNightRow:
         """Record the result of a step. A step that is recorded keeps its first result."""
-        with self._database.write() as session:
-            row = session.get_one(TrainingNightRow, night, with_for_update=True)
-            row.steps = row.steps | {step: row.steps.get(step, result)}
-            return row
+        row = session.get_one(TrainingNightRow, night, with_for_update=True)
+        row.steps = row.steps | {step: row.steps.get(step, result)}
+        return row
 
-    @repeat_after_deadlock
-    def close(self, night: int) -> TrainingNightRow:
+    @writing
+    def close(self, session: Session, night: int) -> TrainingNightRow:
         """End a night. Idempotent."""
-        with self._database.write() as session:
-            row = session.get_one(TrainingNightRow, night, with_for_update=True)
-            row.ended_at = row.ended_at or datetime.now(UTC)
-            return row
+        row = session.get_one(TrainingNightRow, night, with_for_update=True)
+        row.ended_at = row.ended_at or datetime.now(UTC)
+        return row
 
-    def all(self, league: str) -> list[TrainingNightRow]:
+    @reading
+    def all(self, session: Session, league: str) -> list[TrainingNightRow]:
         """Return all nights of a league, oldest first. Raises UnknownLeague."""
         query = select(TrainingNightRow).filter_by(league=league).order_by(TrainingNightRow.id)
-        return leagues.rows(self._database, league, query)
+        return leagues.rows(session, league, query)

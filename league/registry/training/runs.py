@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session, undefer
 from league.errors import InvalidInput, InvalidReference, UnknownRun
 from league.registry import leagues
 from league.registry.processes import this_process
-from league.registry.storage.database import Repository
+from league.registry.storage.database import Repository, as_method, reading, writing
 from league.registry.storage.rows import HEARTBEAT_TIMEOUT, RunPoint, RunRow, RunState
 
 RUNNING = "running"
@@ -28,11 +28,19 @@ MAX_POINTS = 601
 """At this number, every second point is deleted. Odd, so that the first and the last point are kept."""
 
 
+def _get(session: Session, league: str, run: str) -> RunRow:
+    """Return one training run. Raises UnknownLeague or UnknownRun."""
+    leagues.require(session, league)
+    return session.get(RunRow, (league, run)) or _unknown(league, run)
+
+
 class RunRepository(Repository):
     """Records and reads training runs."""
 
+    @writing
     def begin(
         self,
+        session: Session,
         league: str,
         run: str,
         *,
@@ -52,68 +60,67 @@ class RunRepository(Repository):
         continue the run, see `stored`. Raises UnknownLeague.
         """
         started_at = datetime.now(UTC)
-        with self._database.write() as session:
-            leagues.require(session, league)
-            values: dict[str, Any] = {
-                "algorithm": algorithm,
-                "settings": settings,
-                "seed": seed,
-                "target": target,
-                "parent": parent,
-                "exploits": exploits,
-                "reported_state": RUNNING,
-                "error": None,
-                "driver": this_process(),
-                "record": record,
-                "steps": steps,
-                "heartbeat_at": started_at,
-                "ended_at": None,
+        leagues.require(session, league)
+        values: dict[str, Any] = {
+            "algorithm": algorithm,
+            "settings": settings,
+            "seed": seed,
+            "target": target,
+            "parent": parent,
+            "exploits": exploits,
+            "reported_state": RUNNING,
+            "error": None,
+            "driver": this_process(),
+            "record": record,
+            "steps": steps,
+            "heartbeat_at": started_at,
+            "ended_at": None,
+        }
+        row = session.get(RunRow, (league, run), with_for_update=True)
+        if row is None:
+            first: dict[str, Any] = {
+                "attempts": 0,
+                "seconds": 0.0,
+                "curves": {},
+                "spacing": 0,
+                "began_at": started_at,
             }
-            row = session.get(RunRow, (league, run), with_for_update=True)
-            if row is None:
-                first: dict[str, Any] = {
-                    "attempts": 0,
-                    "seconds": 0.0,
-                    "curves": {},
-                    "spacing": 0,
-                    "began_at": started_at,
-                }
-                row = RunRow(league=league, id=run, **first, **values)
-                session.add(row)
-            for name, value in values.items():
-                setattr(row, name, value)
-            row.attempts += 1
-            session.flush()
-            session.execute(delete(RunPoint).filter_by(league=league, run=run).where(RunPoint.steps > steps))
-            return row
+            row = RunRow(league=league, id=run, **first, **values)
+            session.add(row)
+        for name, value in values.items():
+            setattr(row, name, value)
+        row.attempts += 1
+        session.flush()
+        session.execute(delete(RunPoint).filter_by(league=league, run=run).where(RunPoint.steps > steps))
+        return row
 
-    def record(self, league: str, run: str, point: RunPoint | None, seconds: float | None = None) -> None:
+    @writing
+    def record(
+        self, session: Session, league: str, run: str, point: RunPoint | None, seconds: float | None = None
+    ) -> None:
         """Record a heartbeat of a run's driver and the newest point of its curves, if any. Raises UnknownRun.
 
         seconds: training time so far.
         """
-        with self._database.write() as session:
-            row = _locked(session, league, run)
-            row.heartbeat_at = datetime.now(UTC)
-            if seconds is not None:
-                row.seconds = seconds
-            if point is not None:
-                row.steps, row.curves = point.steps, {**row.curves, **point.curves}
-                _keep(session, row, point)
+        row = _locked(session, league, run)
+        row.heartbeat_at = datetime.now(UTC)
+        if seconds is not None:
+            row.seconds = seconds
+        if point is not None:
+            row.steps, row.curves = point.steps, {**row.curves, **point.curves}
+            _keep(session, row, point)
 
-    def end(self, league: str, run: str, state: RunState, error: str | None = None) -> None:
+    @writing
+    def end(self, session: Session, league: str, run: str, state: RunState, error: str | None = None) -> None:
         """Record how a run ended. Raises UnknownRun."""
-        with self._database.write() as session:
-            row = _locked(session, league, run)
-            row.reported_state, row.error = state, error
-            row.heartbeat_at = row.ended_at = datetime.now(UTC)
+        row = _locked(session, league, run)
+        row.reported_state, row.error = state, error
+        row.heartbeat_at = row.ended_at = datetime.now(UTC)
 
-    def get(self, league: str, run: str) -> RunRow:
-        """Return one training run. Raises UnknownLeague or UnknownRun."""
-        with self._database.read() as session:
-            return _get(session, league, run)
+    get = as_method(_get)
 
-    def find(self, text: str) -> RunRow:
+    @reading
+    def find(self, session: Session, text: str) -> RunRow:
         """Return the run with this id, or the only one whose id begins with it; `LEAGUE/RUN` searches one league.
 
         Raises UnknownRun, or InvalidReference with the candidates if there are several.
@@ -123,19 +130,17 @@ class RunRepository(Repository):
         query = select(table).order_by(table.began_at.desc(), table.league, table.id)
         if league:
             query = query.filter_by(league=league)
-        with self._database.read() as session:
-            candidates = list(session.scalars(query.where(table.id.startswith(run, autoescape=True)))) if run else []
-            exact = [row for row in candidates if row.id == run]
-            if len(candidates := exact or candidates) == 1:
-                return candidates[0]
-            listed = ", ".join(
-                f"{row.league}/{row.id}" for row in candidates or session.scalars(query.limit(MAX_LISTED))
-            )
+        candidates = list(session.scalars(query.where(table.id.startswith(run, autoescape=True)))) if run else []
+        exact = [row for row in candidates if row.id == run]
+        if len(candidates := exact or candidates) == 1:
+            return candidates[0]
+        listed = ", ".join(f"{row.league}/{row.id}" for row in candidates or session.scalars(query.limit(MAX_LISTED)))
         if candidates:
             raise InvalidReference(f"training run {text!r} is ambiguous: {listed}")
         raise UnknownRun(f"there is no training run {text!r}; newest: {listed or 'none yet'}")
 
-    def newest(self, league: str, *, before: str | None = None, limit: int = 20) -> list[RunRow]:
+    @reading
+    def newest(self, session: Session, league: str, *, before: str | None = None, limit: int = 20) -> list[RunRow]:
         """Return at most `limit` training runs of a league, newest first.
 
         before: return only runs that began before this one.
@@ -143,16 +148,16 @@ class RunRepository(Repository):
         """
         table = RunRow
         query = select(table).filter_by(league=league).order_by(table.began_at.desc(), table.id.desc()).limit(limit)
-        with self._database.read() as session:
-            leagues.require(session, league)
-            if before is not None:
-                last = session.get(table, (league, before))
-                if last is None:
-                    raise InvalidInput(f"before: league {league} has no training run {before!r}")
-                query = query.where(tuple_(table.began_at, table.id) < (last.began_at, last.id))
-            return list(session.scalars(query))
+        leagues.require(session, league)
+        if before is not None:
+            last = session.get(table, (league, before))
+            if last is None:
+                raise InvalidInput(f"before: league {league} has no training run {before!r}")
+            query = query.where(tuple_(table.began_at, table.id) < (last.began_at, last.id))
+        return list(session.scalars(query))
 
-    def stored(self, league: str, run: str | None = None) -> list[RunRow]:
+    @reading
+    def stored(self, session: Session, league: str, run: str | None = None) -> list[RunRow]:
         """Return the newest runs of a league, or one of them, that can be continued on another machine, newest first.
 
         They have their `record`, which other methods do not read. Raises UnknownLeague.
@@ -162,25 +167,25 @@ class RunRepository(Repository):
         if run is not None:
             query = query.filter_by(id=run)
         with_records = query.options(undefer(table.record)).where(table.record.is_not(None))
-        return leagues.rows(self._database, league, with_records.limit(MAX_STORED))
+        return leagues.rows(session, league, with_records.limit(MAX_STORED))
 
-    def counts(self) -> dict[str, int]:
+    @reading
+    def counts(self, session: Session) -> dict[str, int]:
         """Return league → number of active training runs, of the leagues that have any."""
         alive = (RunRow.reported_state == RUNNING) & (RunRow.heartbeat_at >= datetime.now(UTC) - HEARTBEAT_TIMEOUT)
-        with self._database.read() as session:
-            rows = session.execute(select(RunRow.league, func.count()).where(alive).group_by(RunRow.league))
-            return dict(rows.tuples().all())
+        rows = session.execute(select(RunRow.league, func.count()).where(alive).group_by(RunRow.league))
+        return dict(rows.tuples().all())
 
-    def points(self, league: str, run: str) -> list[RunPoint]:
+    @reading
+    def points(self, session: Session, league: str, run: str) -> list[RunPoint]:
         """Return the points of a run's curves, sorted by steps, fewer than MAX_POINTS.
 
         Raises UnknownLeague or UnknownRun.
         """
         table = RunPoint
         query = select(table).filter_by(league=league, run=run).order_by(table.steps)
-        with self._database.read() as session:
-            _get(session, league, run)
-            return list(session.scalars(query))
+        _get(session, league, run)
+        return list(session.scalars(query))
 
 
 def active(session: Session, league: str) -> tuple[RunRow, ...]:
@@ -192,11 +197,6 @@ def active(session: Session, league: str) -> tuple[RunRow, ...]:
 def is_trained(session: Session, league: str) -> bool:
     """Whether a run of the league sends heartbeats."""
     return any(run.state == RUNNING for run in active(session, league))
-
-
-def _get(session: Session, league: str, run: str) -> RunRow:
-    leagues.require(session, league)
-    return session.get(RunRow, (league, run)) or _unknown(league, run)
 
 
 def _locked(session: Session, league: str, run: str) -> RunRow:

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from league.registry import leagues
-from league.registry.storage.database import Repository, insert
+from league.registry.storage.database import Repository, insert, reading, writing
 from league.registry.storage.rows import StrengthRow
 
 
@@ -28,18 +29,19 @@ class StrengthScore:
 class StrengthRepository(Repository):
     """Records and reads the strength of versions."""
 
-    def record(self, rows: Sequence[StrengthRow]) -> None:
+    @writing
+    def record(self, session: Session, rows: Sequence[StrengthRow]) -> None:
         """Record scores of versions that a run has published. Scores that are recorded already are kept.
 
         Raises UnknownLeague.
         """
-        with self._database.write() as session:
-            for league in {row.league for row in rows}:
-                leagues.require(session, league)
-            insert(session, StrengthRow, [asdict(row) for row in rows])
+        for league in {row.league for row in rows}:
+            leagues.require(session, league)
+        insert(session, StrengthRow, [asdict(row) for row in rows])
 
-    def of_run(self, league: str, run: str) -> list[StrengthRow]:
+    @reading
+    def of_run(self, session: Session, league: str, run: str) -> list[StrengthRow]:
         """Return the scores of a run's versions, oldest version first. Raises UnknownLeague."""
         table = StrengthRow
         query = select(table).filter_by(league=league, run=run).order_by(table.version, table.at, table.opponent)
-        return leagues.rows(self._database, league, query)
+        return leagues.rows(session, league, query)

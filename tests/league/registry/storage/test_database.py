@@ -4,6 +4,7 @@ import shutil
 from contextlib import nullcontext
 from dataclasses import FrozenInstanceError, fields, replace
 from datetime import UTC, datetime
+from inspect import getmembers, ismethod, signature
 from pathlib import Path
 
 import psycopg
@@ -14,7 +15,7 @@ from sqlalchemy.orm.exc import DetachedInstanceError
 from league.errors import ConfigError, StorageError
 from league.registry.registry import Registry
 from league.registry.storage.database import Database
-from league.registry.storage.rows import HEARTBEAT_TIMEOUT, KeyRow, Record, RunRow
+from league.registry.storage.rows import HEARTBEAT_TIMEOUT, KeyRow, Record, RunRow, VersionRow
 from league.settings import Storage
 from tests.support.leagues.registries import LEAGUE, publish, registered
 from tests.support.mounts import fill, read_only, small_disk
@@ -194,6 +195,13 @@ def test_records_are_immutable_after_their_transaction(records: dict[type[Record
     assert key == records[KeyRow]
     assert key != replace(key, expires_at=datetime.now(UTC))
     assert registry.runs.get(LEAGUE, "run") == records[RunRow]
+
+
+def test_callers_see_no_session(registry: Registry) -> None:
+    assert str(signature(registry.versions.get)) == f"(league: str, number: int) -> {VersionRow.__module__}.VersionRow"
+    for repository in vars(registry).values():
+        for name, method in getmembers(repository, ismethod):
+            assert "session" not in signature(method).parameters, name
 
 
 def test_the_record_of_a_run_is_read_only_where_it_is_needed(registry: Registry) -> None:

@@ -8,10 +8,11 @@ from contextlib import contextmanager
 
 import pytest
 from sqlalchemy import text
+from sqlalchemy.orm import Session
 
-from league.errors import DeadlineExceeded, StorageError
+from league.errors import DeadlineExceeded, InvalidReference, StorageError
 from league.registry.registry import Registry
-from league.registry.storage.database import Database, Deadlock, Repository, before, repeat_after_deadlock
+from league.registry.storage.database import Database, Deadlock, Repository, before, writing
 from tests.support.databases import on_both_databases
 from tests.support.leagues.registries import LEAGUE, promote, registered
 from tests.support.waiting import until
@@ -50,6 +51,11 @@ def test_a_transaction_that_ends_after_its_deadline_is_rolled_back(served: Regis
     assert served.aliases.current(LEAGUE) == {"champion": 1}
 
 
+def test_an_invalid_argument_is_reported_before_the_database_is_used(served: Registry) -> None:
+    with before(time.monotonic()), pytest.raises(InvalidReference):
+        served.aliases.set(LEAGUE, "-first", 1, expected=None, actor="ada", reason="a name")
+
+
 def test_deadlines_do_not_outlast_their_block(served: Registry) -> None:
     """With SQLite, the timeout of a lock belongs to the connection."""
     with before(time.monotonic() + 5):
@@ -77,16 +83,22 @@ class Swaps(Repository):
     barrier = threading.Barrier(2, timeout=30)
     attempts = 0
 
-    @repeat_after_deadlock
-    def update(self, first: str, second: str, wait: list[bool]) -> None:
+    @writing
+    def update(self, session: Session, first: str, second: str, wait: list[bool]) -> None:
         """Update two columns, and wait between them at the first attempt only."""
-        with self._database.write() as session:
-            session.execute(text(f"UPDATE {first}"))
-            type(self).attempts += 1
-            if wait:
-                wait.pop()
-                self.barrier.wait()
-            session.execute(text(f"UPDATE {second}"))
+        session.execute(text(f"UPDATE {first}"))
+        type(self).attempts += 1
+        if wait:
+            wait.pop()
+            self.barrier.wait()
+        session.execute(text(f"UPDATE {second}"))
+
+    @writing
+    def fail(self, session: Session) -> None:
+        """Raise as after a deadlock."""
+        session.execute(text("SELECT 1"))
+        type(self).attempts += 1
+        raise Deadlock("deadlock detected")
 
 
 def test_a_deadlock_is_resolved_by_one_repetition(served: Registry) -> None:
@@ -98,12 +110,6 @@ def test_a_deadlock_is_resolved_by_one_repetition(served: Registry) -> None:
         for change in [pool.submit(swaps.update, *order, [True]) for order in (columns, columns[::-1])]:
             change.result()
     assert Swaps.attempts == 3
-
-    @repeat_after_deadlock
-    def fail() -> None:
-        Swaps.attempts += 1
-        raise Deadlock("deadlock detected")
-
     with pytest.raises(StorageError, match="deadlock detected"):
-        fail()
+        swaps.fail()
     assert Swaps.attempts == 3 + 2, "a second one is reported"
