@@ -26,8 +26,9 @@ from league.environments.implementation import stock_stepping
 from league.environments.stepping import Starts
 from league.environments.vector.connect_four import ConnectFour
 from league.environments.vector.vector_env import AgentRows
-from league.registry.gateways import ForSimulators, Gateway
+from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry
+from league.registry.storage.rows import Gateway
 from league.settings import Storage
 from policy_league_client.endpoint import Endpoint
 from policy_league_client.simulator import (

@@ -12,8 +12,8 @@ from starlette.types import Receive, Scope, Send
 
 from league.errors import NoSimulation, Unauthenticated
 from league.refs import check_slug
-from league.registry.gateways import Gateway
 from league.registry.registry import Registry
+from league.registry.storage.rows import Gateway
 from serve_app.access.access_control import KEY, POLICY_VIOLATION, SUBPROTOCOL, AccessControl
 from serve_app.access.connection_limit import ConnectionLimit
 from serve_app.declaration import Declaration, Response

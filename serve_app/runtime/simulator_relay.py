@@ -13,7 +13,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from league.errors import one_line
-from league.registry.gateways import Gateway
+from league.registry.storage.rows import Gateway
 from serve_app.runtime.ray_serve import logger
 from serve_app.runtime.uvicorn_websocket import STREAM_PROTOCOL, StreamWebSocketProtocol
 

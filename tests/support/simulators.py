@@ -11,8 +11,9 @@ from league.environments.building import interface
 from league.environments.implementation import stock_stepping
 from league.environments.stepping import BatchedEnvironment
 from league.errors import LeagueError
-from league.registry.gateways import ForSimulators, Gateway
+from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry
+from league.registry.storage.rows import Gateway
 from league.settings import Storage
 from policy_league_client.simulator import PettingZooGame, SimulatedGame, simulate
 from tests.support.waiting import until

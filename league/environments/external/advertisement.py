@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from league.errors import LeagueError, one_line
-from league.registry.gateways import Gateway
 from league.registry.registry import Registry
+from league.registry.storage.rows import Gateway
 from league.settings import Storage
 
 logger = logging.getLogger(__name__)

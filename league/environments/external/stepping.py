@@ -33,7 +33,8 @@ from league.environments.stepping import (
 from league.environments.vector.vector_env import AgentRows
 from league.errors import EnvironmentMismatch, GameCrashed, InvalidInput, LeagueError
 from league.interface import AgentInterface
-from league.registry.gateways import ForSimulators, Gateway
+from league.registry.gateways import ForSimulators
+from league.registry.storage.rows import Gateway
 
 logger = logging.getLogger(__name__)
 

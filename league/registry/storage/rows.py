@@ -607,6 +607,34 @@ class StrengthRow(Record, kw_only=True):
     at: Mapped[datetime]
 
 
+Purpose = Literal["training", "evaluation"]
+
+
+class Gateway(Record):
+    """An open gateway."""
+
+    __tablename__ = "gateways"
+
+    url: Mapped[str] = mapped_column(String(255), primary_key=True)
+    """The address of its WebSocket server."""
+    token: Mapped[str] = mapped_column(String(255), primary_key=True)
+    """The key that it expects."""
+    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), index=True)
+    purpose: Mapped[Purpose] = mapped_column(String(32))
+    """What its episodes are for."""
+    simulators: Mapped[int] = mapped_column(default=0)
+    """Number of simulators that are connected."""
+    waiting: Mapped[int] = mapped_column(default=0)
+    """Number of episodes that wait for one."""
+    seen_at: Mapped[datetime] = mapped_column(init=False, compare=False)
+    """When it was announced last, by the clock of the database."""
+
+    @property
+    def is_evaluation(self) -> bool:
+        """Whether its episodes are matches of an evaluation."""
+        return self.purpose == "evaluation"
+
+
 @dataclass(frozen=True, slots=True)
 class ChangeToken:
     """A summary of a league's state that differs after any change of the league."""

@@ -190,20 +190,6 @@ class ReplicaTable(Base):
     seen_at: Mapped[datetime] = mapped_column(index=True)
 
 
-class GatewayTable(Base):
-    """An open gateway, see Gateway in `league.registry.gateways`."""
-
-    __tablename__ = "gateways"
-
-    url: Mapped[str] = mapped_column(String(255), primary_key=True)
-    token: Mapped[str] = mapped_column(String(255), primary_key=True)
-    league: Mapped[str] = mapped_column(ForeignKey("leagues.slug"), index=True)
-    purpose: Mapped[str] = mapped_column(String(32))
-    simulators: Mapped[int]
-    waiting: Mapped[int]
-    seen_at: Mapped[datetime]
-
-
 class TrafficEventTable(Base):
     """A setting of canary and shadow with actor and reason. Rows are immutable; the newest is in force."""
 

@@ -10,8 +10,8 @@ from league.errors import InterfaceChanged, InvalidReference, LeagueArchived, Un
 from league.interface import Interface
 from league.refs import CheckpointRef
 from league.registry.aliases import ANY
-from league.registry.gateways import Gateway
 from league.registry.registry import Registry
+from league.registry.storage.rows import Gateway
 from league.results.ledger import Ledger
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
 from tests.support.leagues.registries import LEAGUE, config, interface, publish, registered

@@ -11,9 +11,9 @@ from datetime import timedelta
 import pytest
 
 from league.registry import gateways
-from league.registry.gateways import Gateway
 from league.registry.processes import has_ended, host_name, is_local, this_process
 from league.registry.registry import Registry
+from league.registry.storage.rows import Gateway
 from tests.support.leagues.registries import LEAGUE
 
 PROGRAM = "from league.registry.processes import this_process; print(this_process(), flush=True); input()"

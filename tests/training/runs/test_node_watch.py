@@ -7,8 +7,8 @@ import ray
 from ray.exceptions import RpcError
 
 from league import ray_cluster
-from league.registry.gateways import Gateway
 from league.registry.registry import Registry
+from league.registry.storage.rows import Gateway
 from tests.support.leagues.registries import LEAGUE
 from training.algorithms.resources import Resources
 from training.runs import node_watch, simulator_watch, tune

@@ -24,8 +24,8 @@ from league.environments.external import stepping as external_stepping
 from league.environments.implementation import stock_stepping
 from league.environments.stepping import BatchedEnvironment, Starts, Turn, each_agent_alone
 from league.errors import EnvironmentMismatch, LeagueError
-from league.registry.gateways import Gateway
 from league.registry.registry import Registry
+from league.registry.storage.rows import Gateway
 from league.results.records import Match
 from policy_league_client.endpoint import Endpoint
 from policy_league_client.simulator import (
