@@ -38,6 +38,7 @@ from league.errors import AliasMoved
 from league.histograms import Histogram
 from league.refs import CHAMPION, CheckpointRef, RemoteRef, ScriptRef, parse_ref
 from league.registry.registry import Registry
+from league.registry.storage.manifest import Mixture
 from league.registry.storage.rows import LeagueRow, VerdictRow
 from league.registry.verdicts import VOID
 from league.results.ledger import Ledger
@@ -247,9 +248,10 @@ def _below_floor(contest: Contest, champion: int) -> str | None:
     Replicas count for the members of a mixture.
     """
     registry, verdict = contest.registry, contest.verdict
-    mixtures = registry.versions.mixtures(verdict.league, [verdict.candidate, champion])
+    compositions = registry.versions.compositions(verdict.league, [verdict.candidate, champion])
     candidates, champions = (
-        mixtures[number].versions if number in mixtures else (number,) for number in (verdict.candidate, champion)
+        one.versions if isinstance(one := compositions.get(number), Mixture) else (number,)
+        for number in (verdict.candidate, champion)
     )
     shadow_counts = [
         counts

@@ -1,6 +1,6 @@
 """Published versions and their notes. A version is visible only once it is ready."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,7 +19,6 @@ from league.registry.storage.manifest import (
     TRAINING,
     Manifest,
     Mixture,
-    Role,
     SearchSettings,
 )
 from league.registry.storage.rows import Note, VersionRow, VersionState
@@ -52,22 +51,12 @@ def resolve(session: Session, ref: CheckpointRef | str) -> VersionRow:
     return _get(session, ref.league, number)
 
 
-def mixtures(session: Session, league: str, numbers: Collection[int]) -> dict[int, Mixture]:
-    """Return the mixtures among some versions, by one cheap query."""
-    manifests = _manifests(session, league, MIXTURE, numbers)
-    return {number: manifest.mixture for number, manifest in manifests if manifest.mixture is not None}
-
-
-def searches(session: Session, league: str, numbers: Collection[int]) -> dict[int, SearchSettings]:
-    """Return the searches of the search versions among some versions."""
-    manifests = _manifests(session, league, SEARCH, numbers)
-    return {number: manifest.search for number, manifest in manifests if manifest.search is not None}
-
-
-def players(session: Session, league: str, numbers: Collection[int]) -> dict[int, tuple[int, ...]]:
-    """Return the members of the mixtures among some versions, and what the search versions among them play."""
-    of_mixtures = {number: mixture.versions for number, mixture in mixtures(session, league, numbers).items()}
-    return of_mixtures | {number: (search.version,) for number, search in searches(session, league, numbers).items()}
+def compositions(session: Session, league: str, numbers: Collection[int]) -> dict[int, Mixture | SearchSettings]:
+    """Return the mixtures and the searches among some versions, which play with other versions; by one cheap query."""
+    query = select(VersionTable.number, VersionTable.manifest).filter_by(league=league, state=READY)
+    query = query.where(VersionTable.role.in_((MIXTURE, SEARCH)), VersionTable.number.in_(numbers))
+    manifests = {number: _manifest(league, number, text) for number, text in session.execute(query)}
+    return {number: one for number, manifest in manifests.items() if (one := manifest.mixture or manifest.search)}
 
 
 class VersionRepository(Repository):
@@ -79,9 +68,7 @@ class VersionRepository(Repository):
 
     get = as_method(_get)
     resolve = as_method(resolve)
-    mixtures = as_method(mixtures)
-    searches = as_method(searches)
-    players = as_method(players)
+    compositions = as_method(compositions)
 
     def with_files(self, ref: CheckpointRef) -> VersionRow:
         """Return the version that a reference names now. Raises VersionRetired, and what `resolve` raises."""
@@ -218,15 +205,13 @@ def require_promotable(session: Session, league: str, number: int) -> None:
 
 
 def members(session: Session, league: str, numbers: Collection[int]) -> set[int]:
-    """Return all versions that `players` returns."""
-    return {number for versions in players(session, league, numbers).values() for number in versions}
+    """Return the versions that the mixtures and search versions among some versions play with."""
+    return {version for one in compositions(session, league, numbers).values() for version in one.versions}
 
 
-def _manifests(session: Session, league: str, role: Role, numbers: Collection[int]) -> Iterator[tuple[int, Manifest]]:
-    query = select(VersionTable.number, VersionTable.manifest).filter_by(league=league, state=READY, role=role)
-    for number, text in session.execute(query.where(VersionTable.number.in_(numbers))):
-        assert text is not None, "a ready version has a manifest"
-        yield number, Manifest.from_json(text, source=f"the manifest of {league}@{number}")
+def _manifest(league: str, number: int, text: str | None) -> Manifest:
+    assert text is not None, "a ready version has a manifest"
+    return Manifest.from_json(text, source=f"the manifest of {league}@{number}")
 
 
 def _retired(league: str, number: int) -> None:
@@ -258,16 +243,14 @@ def _rows(session: Session, league: str, versions: list[VersionTable]) -> list[V
     notes = {note.version: Note(note.text, note.actor, note.at) for note in stored_notes}
     rows = []
     for version in versions:
-        assert version.manifest is not None, "a ready version has a manifest"
         assert version.sha256 is not None, "a ready version has a digest"
-        manifest = Manifest.from_json(version.manifest, source=f"the manifest of {league}@{version.number}")
         rows.append(
             VersionRow(
                 league=league,
                 number=version.number,
                 source=version.source,
                 sha256=version.sha256,
-                manifest=manifest,
+                manifest=_manifest(league, version.number, version.manifest),
                 aliases=tuple(names.get(version.number, ())),
                 note=notes.get(version.number),
                 retired_at=version.retired_at,

@@ -13,6 +13,7 @@ from league.policies.loading import baselines
 from league.refs import CHAMPION, CheckpointRef, parse_version
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY
+from league.registry.storage.manifest import Mixture
 from league.registry.storage.rows import Note, VersionRow
 from league.registry.versions import MAX_NOTE_LENGTH
 from league.results.records import Scoring
@@ -246,7 +247,7 @@ def league(registry: Registry, league: str) -> dict[str, Any]:
     """
     row = registry.leagues.get(league)
     aliases = registry.aliases.current(league)
-    mixtures = registry.versions.mixtures(league, set(aliases.values()))
+    compositions = registry.versions.compositions(league, set(aliases.values()))
     acknowledgements = registry.replicas.acknowledgements(league)
     counts = request_counts(registry.replicas.reports().values())
     summary = registry.snapshots.get(league, SUMMARY)
@@ -257,7 +258,11 @@ def league(registry: Registry, league: str) -> dict[str, Any]:
         "actions": row.conditions.actions,
         "champion": aliases.get(CHAMPION),
         "aliases": aliases,
-        "mixtures": {alias: mixtures[number].members for alias, number in aliases.items() if number in mixtures},
+        "mixtures": {
+            alias: one.members
+            for alias, number in aliases.items()
+            if isinstance(one := compositions.get(number), Mixture)
+        },
         "policies": {policy: interface.of_policy(policy).model_dump(mode="json") for policy in interface.policy_ids},
         "agents": interface.policies,
         "sides": interface.sides,

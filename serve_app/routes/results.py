@@ -14,6 +14,7 @@ from league.conditions import Conditions
 from league.errors import InvalidInput, UnknownMatch
 from league.registry.registry import Registry
 from league.registry.snapshots import SUMMARY, earlier_part
+from league.registry.storage.manifest import SearchSettings
 from league.results import records
 from league.results.ledger import Ledger
 from league.service_requests import GameForfeit
@@ -234,7 +235,11 @@ def leaderboard(
     every = document["leaderboard"] if side is None else document["by_side"][side]
     standings, prefix = every[offset : offset + limit], f"{league}@"
     numbers = [int(row["ref"].removeprefix(prefix)) for row in standings if row["ref"].startswith(prefix)]
-    searches = {f"{prefix}{number}": search for number, search in registry.versions.searches(league, numbers).items()}
+    searches = {
+        f"{prefix}{number}": one
+        for number, one in registry.versions.compositions(league, numbers).items()
+        if isinstance(one, SearchSettings)
+    }
     page = [
         {"rank": offset + place, "search": searches.get(standing["ref"])} | standing
         for place, standing in enumerate(standings, 1)

@@ -183,14 +183,17 @@ class LeagueOpponents:
         assert self._settings is not None
         league = self._league.league
         numbers = registry.versions.numbers(league).get(league, [])
-        players, exploiters = registry.versions.players(league, numbers), registry.versions.exploiter_refs(league)
-        numbers = [number for number in numbers if number not in players]
+        compositions, exploiters = (
+            registry.versions.compositions(league, numbers),
+            registry.versions.exploiter_refs(league),
+        )
+        numbers = [number for number in numbers if number not in compositions]
         candidates = {number for number in numbers if f"{league}@{number}" not in exploiters}
         candidates = set(sorted(candidates)[-self._settings.window :])
         champions = {event.version for event in registry.aliases.history(league)}
         if self._settings.champions:
             for champion in champions:
-                candidates |= set(players.get(champion, (champion,)))
+                candidates |= set(compositions[champion].versions if champion in compositions else (champion,))
         if self._settings.exploiters:
             of_champions = registry.versions.exploiters(league, [f"{league}@{champion}" for champion in champions])
             newest = {exploiter.exploits: exploiter.number for exploiter in of_champions}

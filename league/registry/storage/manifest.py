@@ -90,6 +90,11 @@ class SearchSettings(FrozenModel):
     ms: float = Field(gt=0)
     """Milliseconds of a search from the initial position, on the machine that published the version."""
 
+    @property
+    def versions(self) -> tuple[int, ...]:
+        """The number of the version, as in a mixture."""
+        return (self.version,)
+
     def __str__(self) -> str:
         return f"@{self.version}, {self.simulations} simulations, {self.rule}, {self.ms:.3g} ms"
 

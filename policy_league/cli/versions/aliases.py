@@ -241,13 +241,19 @@ def history(
     as_json: AsJson = False,
 ) -> None:
     """Show when and why an alias moved, and who moved it."""
+    from league.registry.storage.manifest import Mixture
+
     try:
         when = None if at is None else datetime.fromisoformat(at).astimezone(UTC)  # local time, unless it says another
     except ValueError as error:
         raise ConfigError(f"--at {at!r}: expected a time such as '2026-03-03 14:00'") from error
     registry = open_registry()
     events = registry.aliases.history(check_slug("league", league), check_alias(alias), when)
-    mixtures = registry.versions.mixtures(league, {event.version for event in events})
+    mixtures = {
+        number: one
+        for number, one in registry.versions.compositions(league, {event.version for event in events}).items()
+        if isinstance(one, Mixture)
+    }
     if as_json:
         members = {number: [member.model_dump() for member in one.members] for number, one in mixtures.items()}
         documents = [_document(event) | {"members": members.get(event.version)} for event in events]
