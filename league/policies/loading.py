@@ -88,14 +88,6 @@ def players(ref: str, registry: Registry) -> dict[str, float]:
     return {f"{parsed.league}@{member.version}": member.probability for member in mixture.members}
 
 
-def require_one_policy(version: VersionRow) -> None:
-    """Raise InvalidInput, which names the versions that play, if a version has no policies of its own."""
-    if version.search is not None:
-        raise InvalidInput(f"{version.ref} searches ({version.search}): name @{version.search.version} instead")
-    if version.mixture is not None:
-        raise InvalidInput(f"{version.ref} is a mixture ({version.mixture}): name one of its members")
-
-
 def contestant(ref: str, registry: Registry | None, interface: Interface) -> dict[str, tuple[str, Policy]]:
     """Load the policies of a contestant for all agents.
 
@@ -136,7 +128,7 @@ def _version(ref: CheckpointRef, registry: Registry | None, interface: Interface
 
 
 def _policy(registry: Registry, version: VersionRow, policy: str | None) -> Policy:
-    require_one_policy(version)
+    version.require_policies()
     manifest = version.manifest.policies[policy_id(version, policy)]
     graph = registry.artifacts.read(version.manifest, manifest.file)
     return OnnxPolicy(graph, manifest, version.manifest.has_distribution)

@@ -19,7 +19,6 @@ from sqlalchemy.orm import Session
 from league.errors import (
     EnvironmentMismatch,
     InterfaceChanged,
-    InvalidInput,
     NotPromotable,
     StorageError,
     VersionRetired,
@@ -210,10 +209,7 @@ def _without_policies(
 def _check_base(version: VersionRow, interface_digest: str) -> None:
     if version.retired_at is not None:
         raise VersionRetired(f"{version.ref} was retired and its files were removed: it cannot play")
-    if version.mixture is not None:
-        raise InvalidInput(f"{version.ref} is a mixture ({version.mixture}): name one of its members")
-    if version.search is not None:
-        raise InvalidInput(f"{version.ref} searches ({version.search}): name @{version.search.version} instead")
+    version.require_policies()
     if version.manifest.interface.digest() != interface_digest:
         raise EnvironmentMismatch(f"{version.ref} has other spaces or policies than league {version.league} has now")
 

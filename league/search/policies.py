@@ -161,7 +161,7 @@ def search_policies(
 
 def value_graphs(version: VersionRow) -> dict[str, str]:
     """Return policy id → file of the value graph. Raises InvalidInput if the version has none."""
-    loading.require_one_policy(version)
+    version.require_policies()
     files = {policy: manifest.value for policy, manifest in version.manifest.policies.items()}
     graphs = {policy: file for policy, file in files.items() if file is not None}
     if len(graphs) < len(files):

@@ -13,7 +13,7 @@ from sqlalchemy import JSON, BigInteger, ForeignKey, ForeignKeyConstraint, Index
 from sqlalchemy.orm import Mapped, MappedAsDataclass, mapped_column
 
 from league.conditions import Conditions, action_selection
-from league.errors import LeagueArchived
+from league.errors import InvalidInput, LeagueArchived
 from league.histograms import Histogram
 from league.interface import Interface
 from league.refs import short_verdict
@@ -150,6 +150,13 @@ class VersionRow:
     def search(self) -> SearchSettings | None:
         """The search of a search version; None for other versions."""
         return self.manifest.search
+
+    def require_policies(self) -> None:
+        """Raise InvalidInput, which names the versions that play, if the version has no policies of its own."""
+        if self.search is not None:
+            raise InvalidInput(f"{self.ref} searches ({self.search}): name @{self.search.version} instead")
+        if self.mixture is not None:
+            raise InvalidInput(f"{self.ref} is a mixture ({self.mixture}): name one of its members")
 
     @property
     def steps(self) -> int:

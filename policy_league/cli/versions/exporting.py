@@ -30,14 +30,13 @@ def export(
     The files are verified against their digests. docs/exporting.md shows how to run them in a browser, Unity, Godot and
     C++. `league import` reads the directory. With --hub or --mlflow, a model card describes interface and results.
     """
-    from league.policies.loading import require_one_policy
     from league.registry.storage.exports import CARD, exported_files, write_files, write_folder
 
     if hub and mlflow:
         raise InvalidInput("--hub and --mlflow have different targets: export twice")
     registry = open_registry()
     version = registry.versions.with_files(CheckpointRef.parse(ref))
-    require_one_policy(version)
+    version.require_policies()
     files = exported_files(version, registry.artifacts)
     directory = Path(target or f"{version.league}-{version.number}")
     if not (hub or mlflow):
