@@ -30,6 +30,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from rich.console import Console
 
 from benchmarks.harness import CONFIGS, Parts, Quick, Target, chosen
+from benchmarks.optimal_play import blotto_exploitability
 from benchmarks.training.league_arms import MINUTES, compare_arms
 from benchmarks.training.league_arms import SEEDS as CONNECT_FOUR_SEEDS
 from benchmarks.training.learned import local_ray, one_thread, updates
@@ -39,7 +40,7 @@ from league.registry.registry import Registry
 from league.results.equilibria import nash_averaging
 from league.settings import Storage
 from league.spaces import OBSERVATION
-from policy_league.examples.blotto import PAYOFF, exploitability
+from policy_league.examples.blotto import PAYOFF
 from training.algorithms.league_algorithm import LeagueAlgorithm
 from training.algorithms.metrics import totals
 from training.export.publish import Checkpoint, publish
@@ -119,9 +120,9 @@ def blotto(quick: bool) -> Iterator[Target]:
         for seed in SEEDS:
             policies = trained(settings, seed, 100_000 if quick else 1_000_000)
             payoff = policies @ PAYOFF @ policies.T
-            values["last"].append(exploitability(policies[-1]))
-            values["nash"].append(exploitability(nash_averaging(payoff)[0] @ policies))
-            values["average"].append(exploitability(policies[len(policies) // 2 :].mean(axis=0)))
+            values["last"].append(blotto_exploitability(policies[-1]))
+            values["nash"].append(blotto_exploitability(nash_averaging(payoff)[0] @ policies))
+            values["average"].append(blotto_exploitability(policies[len(policies) // 2 :].mean(axis=0)))
         for kind, of_seeds in values.items():
             mean = round(statistics.mean(of_seeds), 3)
             if (arm, kind) == ("self-play", "last"):

@@ -18,6 +18,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from scipy import stats
 
 from benchmarks.harness import CONFIGS, Parts, Quick, Target, chosen
+from benchmarks.optimal_play import crossing_optimum
 from benchmarks.training.learned import (
     LearningCurve,
     in_processes,
@@ -31,7 +32,6 @@ from benchmarks.training.pistonball import pistonball
 from benchmarks.training.two_step import two_step_game
 from benchmarks.training.value_learning import connect_four_dqn, leduc_holdem_dqn, leduc_vs_random
 from league.config.league import LeagueConfig
-from policy_league.examples import traffic
 from training.sampling.episode_chunks import EpisodeChunks
 
 SEEDS = range(5)
@@ -90,7 +90,7 @@ def rps(scale: float) -> Iterator[Target]:
 
 def cars_and_lights(scale: float) -> Iterator[Target]:
     """Three seeds compared with the optimum, computed by the environment's solver."""
-    best = traffic.optimum(**LeagueConfig.load(CONFIGS / "cars_and_lights.yaml").environment.kwargs)
+    best = crossing_optimum(**LeagueConfig.load(CONFIGS / "cars_and_lights.yaml").environment.kwargs)
     jobs = [LearningJob("cars_and_lights", {"seed": seed}, 120 * scale) for seed in range(3)]
     shares = [
         100 * (curve.greedy.mean() - curve.random.mean()) / (best - curve.random.mean())

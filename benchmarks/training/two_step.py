@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from ray.rllib.algorithms.algorithm import Algorithm
 
 from benchmarks.harness import CONFIGS, Target
+from benchmarks.optimal_play import two_step_values
 from benchmarks.training.learned import greedy_returns, in_processes, local_ray, one_thread
 from league.config.league import LeagueConfig
 from league.environments.building import interface
-from policy_league.examples.two_step import ACTIONS, AGENTS, STATES, values
+from policy_league.examples.two_step import ACTIONS, AGENTS, STATES
 from training.runs.trial import build_algorithm
 
 CONFIG = CONFIGS / "two_step_game.yaml"
@@ -36,7 +37,7 @@ class LearningResult:
 
     def error(self, gamma: float) -> float:
         """Largest difference from the closed form."""
-        return float(np.abs(self.joint - values(gamma)).max())
+        return float(np.abs(self.joint - two_step_values(gamma)).max())
 
 
 def learn(mixer: str, seed: int, **settings: object) -> LearningResult:

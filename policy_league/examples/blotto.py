@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 AGENTS = ("player_0", "player_1")
@@ -52,11 +51,6 @@ class Blotto(ParallelEnv):
 
 def _each(value: Any) -> dict[str, Any]:
     return dict.fromkeys(AGENTS, value)
-
-
-def exploitability(probabilities: NDArray[np.float64]) -> float:
-    """Return what a best response wins against a policy, (actions,); 0 at an equilibrium, as the game is symmetric."""
-    return float((PAYOFF @ probabilities).max())
 
 
 def env() -> Blotto:

@@ -11,7 +11,6 @@ passes at red may collide with the other road's. Everything but the initial dist
 | light | −½ for each car that has not passed; −5 if both are green |
 """
 
-from functools import cache
 from itertools import combinations, product
 from typing import Any
 
@@ -166,28 +165,3 @@ def lights_reward(distances: Distances, colours: Colours) -> float:
     """Return each light's reward for a step that starts in this state."""
     left = sum(distance > 0 for road in distances for distance in road)
     return WAITING * left + (BOTH_GREEN if all(colours) else 0.0)
-
-
-def optimum(cars: int = 2, length: int = 4, steps: int = 20) -> float:
-    """Return the maximum expected return per agent over all joint policies, by dynamic programming.
-
-    Bellman, 1957: V(s, t) = max_a [r(s, a) + V(s', t + 1)], averaged over the initial states.
-    """
-
-    @cache
-    def value(distances: Distances, colours: Colours, time: int) -> float:
-        if time == steps or not any(map(any, distances)):
-            return 0.0
-        to_lights = ROADS * lights_reward(distances, colours)
-        best = -np.inf
-        choices = [(0, 1) if distance else (0,) for road in distances for distance in road]
-        for flat in product(*choices):
-            drives = tuple(flat[road * cars : (road + 1) * cars] for road in range(ROADS))
-            after, rewards = move(distances, colours, drives)
-            paid = to_lights + sum(map(sum, rewards))
-            following = max(value(after, lights, time + 1) for lights in product((RED, GREEN), repeat=ROADS))
-            best = max(best, paid + following)
-        return best
-
-    agents = ROADS * (cars + 1)
-    return float(np.mean([value(start, (RED,) * ROADS, 0) for start in starts(cars, length)])) / agents

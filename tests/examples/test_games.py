@@ -12,29 +12,29 @@ from hypothesis import strategies as st
 from pettingzoo.classic import leduc_holdem_v4
 from pettingzoo.test import api_test, parallel_api_test, seed_test
 
+from benchmarks.optimal_play import blotto_exploitability, crossing_optimum, two_step_values
 from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import compare
 from league.random import splitmix64
 from league.results.equilibria import nash_averaging
 from policy_league.examples import kuhn_poker, leduc_holdem
-from policy_league.examples.blotto import COINS, DIVISIONS, FIELDS, PAYOFF, Blotto, exploitability
+from policy_league.examples.blotto import COINS, DIVISIONS, FIELDS, PAYOFF, Blotto
 from policy_league.examples.blotto_vector import BlottoVector
 from policy_league.examples.kuhn_poker import BET, DEALS, PASS, KuhnPoker
 from policy_league.examples.kuhn_poker_vector import KuhnPokerVector
 from policy_league.examples.leduc_holdem import MOST_ACTIONS, NUM_ACTIONS, ROUNDS, STOCK_SIZE
 from policy_league.examples.leduc_holdem_vector import LeducWithHistoryVector
-from policy_league.examples.traffic import GREEN, RED, Crossing, lights_reward, move, optimum, starts
+from policy_league.examples.traffic import GREEN, RED, Crossing, lights_reward, move, starts
 from policy_league.examples.two_step import (
     AGENTS,
     FIRST,
     GAME_A,
     GAME_B,
     PAYOFFS,
-    multi_agent_env,
     parallel_env,
-    values,
 )
 from tests.support.environments.plans import Plan, assert_equal, last_rows, plans
+from tests.support.environments.rllib_two_step import multi_agent_env
 
 KUHN = EnvironmentConfig(entry_point="policy_league.examples.kuhn_poker")
 LEDUC = EnvironmentConfig(entry_point="policy_league.examples.leduc_holdem:env")
@@ -189,8 +189,8 @@ def test_payoffs_equal_those_of_open_spiel() -> None:
 
 
 def test_only_a_mixed_policy_is_not_exploitable() -> None:
-    assert exploitability(nash_averaging(PAYOFF)[0]) == pytest.approx(0, abs=1e-6)
-    assert exploitability(np.eye(len(PAYOFF))[0]) == pytest.approx(1)
+    assert blotto_exploitability(nash_averaging(PAYOFF)[0]) == pytest.approx(0, abs=1e-6)
+    assert blotto_exploitability(np.eye(len(PAYOFF))[0]) == pytest.approx(1)
 
 
 def test_waiting_at_red_costs_and_two_cars_in_the_crossing_crash() -> None:
@@ -212,11 +212,11 @@ def test_the_optimum_with_one_car_per_road_equals_the_manual_result() -> None:
     """Both cars start at 1, both lights are red: one light turns green (step 1), a car passes while the other light
     turns green (step 2), the other car passes (step 3). Cars: −2 and −3; lights, each: −1, −1, −½.
     """
-    assert optimum(cars=1, length=1) == pytest.approx((-2 - 3 + 2 * (-1 - 1 - 0.5)) / 4)
+    assert crossing_optimum(cars=1, length=1) == pytest.approx((-2 - 3 + 2 * (-1 - 1 - 0.5)) / 4)
 
 
 def test_random_play_does_not_exceed_the_optimum_and_rewards_follow_the_rules() -> None:
-    env, best = Crossing(cars=1, length=2), optimum(cars=1, length=2)
+    env, best = Crossing(cars=1, length=2), crossing_optimum(cars=1, length=2)
     returns = []
     rng = np.random.default_rng(0)
     for seed in range(300):
@@ -279,7 +279,7 @@ def test_the_first_agent_selects_the_game_that_determines_the_rewards(make: Any)
 
 
 def test_values_equal_the_paper_and_enumeration() -> None:
-    table = values(GAMMA)
+    table = two_step_values(GAMMA)
     np.testing.assert_allclose(table[FIRST], [[6.93, 6.93], [7.92, 7.92]])
     np.testing.assert_array_equal(table[GAME_A], np.full((2, 2), 7))
     np.testing.assert_array_equal(table[GAME_B], [[0, 1], [1, 8]])

@@ -115,7 +115,7 @@ SOUND: dict[str, list[Arguments]] = {
     f"{MPE}simple_speaker_listener_v4": [SHORT],
     PISTONBALL: [PISTONS],
     f"{EXAMPLES}two_step:parallel_env": [{}],
-    f"{EXAMPLES}two_step:multi_agent_env": [{}],
+    f"{SUPPORT}rllib_two_step:multi_agent_env": [{}],
     f"{EXAMPLES}traffic:crossing": [{}],
     KUHN: [{}],
     f"{EXAMPLES}leduc_holdem:env": [{}],

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.optimal_play import crossing_optimum
 from benchmarks.training.learned import LearningCurve, learn
 from league.config.league import LeagueConfig
-from policy_league.examples import traffic
 
 CONFIGS = Path(__file__).parents[2] / "policy_league/configs"
 # Training takes minutes on a busy machine, more than the timeout of other tests.
@@ -29,7 +29,7 @@ def test_rps_learns_the_best_response_to_a_fixed_opponent(opponent: str) -> None
 
 def test_cars_and_lights_approaches_the_optimum() -> None:
     learned = train("cars_and_lights", 400_000)
-    best = traffic.optimum(**load_config("cars_and_lights").environment.kwargs)
+    best = crossing_optimum(**load_config("cars_and_lights").environment.kwargs)
     share = (learned.greedy.mean() - learned.random.mean()) / (best - learned.random.mean())
     assert share > 0.6, share
 

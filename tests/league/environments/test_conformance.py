@@ -95,7 +95,7 @@ def test_valid_environments_pass(subtests: pytest.Subtests) -> None:
         (SPREAD, {}, [25] * 3, 25),
         (f"{CLASSIC}leduc_holdem_v4", {}, None, None),
         (f"{CLASSIC}rps_v2", {}, None, None),
-        (f"{TWO_STEP}multi_agent_env", {}, None, None),
+        (f"{SUPPORT}.rllib_two_step:multi_agent_env", {}, None, None),
         (CROSSING, {}, None, None),
     ):
         with subtests.test(entry_point=entry_point, kwargs=kwargs):

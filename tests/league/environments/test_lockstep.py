@@ -298,7 +298,7 @@ LOOPS: list[tuple[str, dict[str, Any]]] = [
     (f"{SUPPORT}simultaneous:rllib_meeting", {"silent": True}),
     ("policy_league.examples.traffic:crossing", {}),
     (f"{TWO_STEP}parallel_env", {}),
-    (f"{TWO_STEP}multi_agent_env", {}),
+    (f"{SUPPORT}rllib_two_step:multi_agent_env", {}),
 ]
 """Functions that create environments, with their arguments."""
 

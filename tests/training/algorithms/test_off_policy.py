@@ -413,7 +413,10 @@ def test_agents_of_a_team_are_trained_on_while_they_are_present(settings: dict[s
 def test_the_mixer_uses_the_state_of_rllib_infos() -> None:
     config = LeagueConfig.load("policy_league/configs/two_step_game.yaml")
     document = config.model_dump(mode="json", by_alias=True)
-    document["environment"] |= {"entry_point": "policy_league.examples.two_step:multi_agent_env", "wrappers": []}
+    document["environment"] |= {
+        "entry_point": "tests.support.environments.rllib_two_step:multi_agent_env",
+        "wrappers": [],
+    }
     document["policies"] = {"first": ["agent_0"], "second": ["agent_1"]}
     with running(LeagueConfig.from_mapping(document)) as algorithm:
         algorithm.train()
