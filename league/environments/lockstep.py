@@ -1,7 +1,7 @@
 """Steps n copies of an environment in lockstep and batches their observations."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from time import perf_counter
 
@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from league.environments.copies import Copies
 from league.environments.stepping import (
-    Batch,
     BatchedEnvironment,
     Indices,
     NextEpisodes,
@@ -92,8 +91,7 @@ class Lockstep(BatchedEnvironment):
         for block in acting:
             if len(block.envs):
                 alike[self.copies.first_alike[block.agents[0]]].append(block)
-        batches = {group: batch for blocks in alike.values() for group, batch in self._split(blocks)}
-        turn.batches = self._pending = dict(sorted(batches.items()))
+        turn.batches = self._pending = self._batches(alike.values())
         return turn
 
     def _playing(self) -> Indices:
@@ -123,35 +121,8 @@ class Lockstep(BatchedEnvironment):
             acts[block.envs] = True
         return acts
 
-    def _split(self, blocks: Sequence[AgentRows]) -> Iterator[tuple[int, Batch]]:
-        """Return the groups of agents with the same observations, and the rows of each."""
-        names = blocks[0].observations
-        batch = Batch(
-            joined([block.envs for block in blocks]),
-            joined([block.agents for block in blocks]),
-            {name: joined([block.observations[name] for block in blocks]) for name in names},
-            joined([block.rewards for block in blocks]),
-        )
-        groups = self._groups[batch.envs, batch.agents]
-        present = np.bincount(groups).nonzero()[0].tolist()
-        if len(blocks) == len(present) == 1:
-            yield present[0], batch
-            return
-        by_env = None
-        if len(blocks) > 1:
-            by_env = np.argsort(batch.envs, kind="stable")
-            groups = groups.take(by_env)
-        for group in present:
-            rows = (groups == group).nonzero()[0]
-            yield group, batch.rows(rows if by_env is None else by_env.take(rows))
-
     def _states(self, envs: Indices) -> States | None:
         if not self._gives_states or not len(envs):
             return None
         values = self.copies.states(envs)
         return None if values is None else States(envs, values)
-
-
-def joined(columns: Sequence[NDArray]) -> NDArray:
-    """Return columns, one below the other."""
-    return columns[0] if len(columns) == 1 else np.concatenate(columns)

@@ -240,6 +240,38 @@ class BatchedEnvironment(ABC):
         self._seeds[starts.envs] = starts.seeds % 2**31
         return starts.envs
 
+    def _batches(self, alike: Iterable[Sequence[AgentRows]]) -> dict[int, Batch]:
+        """Return the rows of agents that must act by ascending group. alike: blocks with the same observations."""
+        batches = dict(pair for blocks in alike for pair in self._split(blocks))
+        return dict(sorted(batches.items()))
+
+    def _split(self, blocks: Sequence[AgentRows]) -> Iterator[tuple[int, Batch]]:
+        """Return the groups of agents with the same observations, and the rows of each."""
+        names = blocks[0].observations
+        batch = Batch(
+            joined([block.envs for block in blocks]),
+            joined([block.agents for block in blocks]),
+            {name: joined([block.observations[name] for block in blocks]) for name in names},
+            joined([block.rewards for block in blocks]),
+        )
+        groups = self._groups[batch.envs, batch.agents]
+        present = np.bincount(groups).nonzero()[0].tolist()
+        if len(blocks) == len(present) == 1:
+            yield present[0], batch
+            return
+        by_env = None
+        if len(blocks) > 1:
+            by_env = np.argsort(batch.envs, kind="stable")
+            groups = groups.take(by_env)
+        for group in present:
+            rows = (groups == group).nonzero()[0]
+            yield group, batch.rows(rows if by_env is None else by_env.take(rows))
+
+
+def joined(columns: Sequence[NDArray]) -> NDArray:
+    """Return columns, one below the other."""
+    return columns[0] if len(columns) == 1 else np.concatenate(columns)
+
 
 ROUNDING = 1e-5
 """Relative tolerance for actions at the bounds of a Box."""

@@ -142,7 +142,7 @@ class WrappedVectorEnv(VectorEnv):
                 observations = {OBSERVATION: changed.astype(self._dtypes[agent], copy=False)}
             changed_rows = replace(rows, rewards=rewards, observations=observations)
             joined.setdefault(self._first_after[agent], []).append(changed_rows)
-        return [_merged(joined[first]) for first in sorted(joined)]
+        return [blocks[0] if len(blocks) == 1 else AgentRows.joined(blocks) for _, blocks in sorted(joined.items())]
 
 
 def wrapped_vector(make: MakeVectorEnv, config: EnvironmentConfig) -> MakeVectorEnv:
@@ -181,11 +181,3 @@ def _reward_change(wrapper: WrapperConfig) -> Change:
         raise UnsupportedWrapper(f"wrapper {wrapper.name} is vectorised for bounds on both sides of 0 only")
     # The sum, as in the stock environment, turns -0.0 into 0.0.
     return lambda rewards: 0.0 + np.clip(rewards, lowest, highest)
-
-
-def _merged(blocks: Sequence[AgentRows]) -> AgentRows:
-    """Return the rows of some blocks in one, sorted by environment, then by agent."""
-    if len(blocks) == 1:
-        return blocks[0]
-    rows = AgentRows.concatenated(blocks)
-    return rows.take(np.lexsort((rows.agents, rows.envs)))

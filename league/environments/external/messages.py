@@ -14,6 +14,7 @@ import orjson
 from numpy.typing import NDArray
 
 from league.environments.stepping import Indices
+from league.environments.vector.vector_env import AgentRows
 from league.errors import InvalidInput, InvalidReward, LeagueError, ObservationError
 from league.interface import AgentInterface
 from league.spaces import ACTION_MASK, DictSpace, Leaf
@@ -42,39 +43,17 @@ KEYS = frozenset(("episode", "agent", "observation", "reward", "terminated", "tr
 
 
 @dataclass(frozen=True, slots=True)
-class ReportRows:
-    """k reports of agents with equal spaces, in the order of the message.
-
-    Attributes:
-        layout: Number of the layout.
-        episodes: (k,).
-        agents: (k,).
-        observations: ONNX input name → (k, …).
-        rewards: (k,), finite.
-        terminated: (k,).
-        truncated: (k,).
-    """
-
-    layout: int
-    episodes: Indices
-    agents: Indices
-    observations: dict[str, NDArray]
-    rewards: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True)
 class Reports:
-    """A message with reports: its rows, and the episodes that are over with them."""
+    """A message with reports, and the episodes that are over with them."""
 
-    rows: list[ReportRows]
+    rows: list[tuple[int, AgentRows]]
+    """(number of the layout, reports of its agents in the order of the message, whose `envs` are episodes)."""
     over: list[int]
 
     @property
     def nbytes(self) -> int:
         """The size of the observations in memory."""
-        return sum(array.nbytes for part in self.rows for array in part.observations.values())
+        return sum(array.nbytes for _, part in self.rows for array in part.observations.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +231,7 @@ class MessageCodec:
         if (mask := observations.get(ACTION_MASK)) is not None:
             check_mask(mask[(flags & (TERMINATED | TRUNCATED)) == 0])
         terminated, truncated = ((flags & flag) != 0 for flag in (TERMINATED, TRUNCATED))
-        reports.rows.append(ReportRows(number, episodes, agents, observations, rewards, terminated, truncated))
+        reports.rows.append((number, AgentRows(episodes, agents, observations, rewards, terminated, truncated)))
         reports.over.extend(episodes[(flags & OVER) != 0].tolist())
 
     def _reports(self, document: dict[str, Any], most: int) -> Reports:
@@ -268,17 +247,15 @@ class MessageCodec:
             episodes, agents, observations, rewards, terminated, truncated = zip(*part, strict=True)
             rewards_array = np.array(rewards, np.float64)
             _check_rewards(rewards_array)
-            rows.append(
-                ReportRows(
-                    number,
-                    np.array(episodes, np.int64),
-                    np.array(agents, np.int64),
-                    self.layouts[number].reader.read(observations, is_last=is_last),
-                    rewards_array,
-                    np.array(terminated, bool),
-                    np.array(truncated, bool),
-                )
+            agent_rows = AgentRows(
+                np.array(episodes, np.int64),
+                np.array(agents, np.int64),
+                self.layouts[number].reader.read(observations, is_last=is_last),
+                rewards_array,
+                np.array(terminated, bool),
+                np.array(truncated, bool),
             )
+            rows.append((number, agent_rows))
         return Reports(rows, _episodes("over", document.get("over", [])))
 
     def _report(self, report: Any) -> tuple[int, int, Any, float, bool, bool]:

@@ -3,7 +3,7 @@
 import logging
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from queue import Empty
 from time import perf_counter
 
@@ -16,13 +16,11 @@ from league.environments.external.gateway import Arrival, GatewayServer, Joined,
 from league.environments.external.messages import (
     MAX_EPISODE,
     MessageCodec,
-    ReportRows,
     Reports,
     abandon,
     play,
 )
 from league.environments.stepping import (
-    Batch,
     BatchedEnvironment,
     Indices,
     NextEpisodes,
@@ -49,41 +47,8 @@ ALONE = 3.0
 NO_EPISODE = -1
 
 
-@dataclass(frozen=True, slots=True)
-class _Rows:
-    """Rows of one message: of agents that must act, or of the last reports of agents."""
-
-    envs: Indices
-    episodes: Indices
-    agents: Indices
-    observations: Mapping[str, NDArray]
-    rewards: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-
-    def rows(self, rows: NDArray) -> "_Rows":
-        observations = {name: array[rows] for name, array in self.observations.items()}
-        parts = (self.envs, self.episodes, self.agents, self.rewards, self.terminated, self.truncated)
-        envs, episodes, agents, rewards, terminated, truncated = (part[rows] for part in parts)
-        return _Rows(envs, episodes, agents, observations, rewards, terminated, truncated)
-
-    def last_reports(self) -> AgentRows:
-        """Return the rows as those of agents that have left."""
-        return AgentRows(self.envs, self.agents, dict(self.observations), self.rewards, self.terminated, self.truncated)
-
-    @staticmethod
-    def joined(parts: Sequence["_Rows"]) -> "_Rows":
-        """Return the rows of all parts, sorted by environment and agent."""
-        envs, agents = (np.concatenate([getattr(part, name) for part in parts]) for name in ("envs", "agents"))
-        order = np.lexsort((agents, envs))
-        columns = {
-            name: np.concatenate([getattr(part, name) for part in parts])[order]
-            for name in ("episodes", "rewards", "terminated", "truncated")
-        }
-        observations = {
-            name: np.concatenate([part.observations[name] for part in parts])[order] for name in parts[0].observations
-        }
-        return _Rows(envs=envs[order], agents=agents[order], observations=observations, **columns)
+Waiting = dict[int, list[tuple[Indices, AgentRows]]]
+"""Number of a layout → (episodes, rows) of each message."""
 
 
 class ExternalStepping(BatchedEnvironment):
@@ -134,8 +99,8 @@ class ExternalStepping(BatchedEnvironment):
         self._is_shown = np.zeros(self.num_envs, bool)
         self._env_of: dict[int, int] = {}
         self._queue: deque[int] = deque()
-        self._acting: dict[int, list[_Rows]] = defaultdict(list)
-        self._ended: dict[int, list[_Rows]] = defaultdict(list)
+        self._acting: Waiting = defaultdict(list)
+        self._ended: Waiting = defaultdict(list)
         self._finished: list[int] = []
 
     def start(self, next_episodes: NextEpisodes) -> Turn:
@@ -327,8 +292,8 @@ class ExternalStepping(BatchedEnvironment):
         """Add the reports of a message, and the environments whose episodes are over with it. Raises InvalidInput."""
         if link.sent_at:
             link.seconds = max(0.0, perf_counter() - link.sent_at)
-        for rows in message.rows:
-            self._read_rows(link, rows)
+        for layout, reports in message.rows:
+            self._read_rows(link, layout, reports)
         for episode in dict.fromkeys(message.over):
             if (env := self._env(link, episode)) is not None:
                 self._finish(link, env)
@@ -345,21 +310,14 @@ class ExternalStepping(BatchedEnvironment):
             return None
         raise InvalidInput(f"episode {episode} is not one of this simulator")
 
-    def _read_rows(self, link: SimulatorLink, message: ReportRows) -> None:
-        envs_or_none = [self._env(link, episode) for episode in message.episodes.tolist()]
+    def _read_rows(self, link: SimulatorLink, layout: int, reports: AgentRows) -> None:
+        envs_or_none = [self._env(link, episode) for episode in reports.envs.tolist()]
         envs = np.array([NO_EPISODE if env is None else env for env in envs_or_none], np.int64)
-        rows = _Rows(
-            envs,
-            message.episodes,
-            message.agents,
-            message.observations,
-            message.rewards,
-            message.terminated,
-            message.truncated,
-        )
+        rows, episodes = replace(reports, envs=envs), reports.envs
         if (envs == NO_EPISODE).any():
-            rows = rows.rows(np.flatnonzero(envs != NO_EPISODE))
-        if not len(rows.envs):
+            kept = np.flatnonzero(envs != NO_EPISODE)
+            rows, episodes = rows.take(kept), episodes.take(kept)
+        if not len(episodes):
             return
         envs, agents = rows.envs, rows.agents
         slots = envs * len(self.agents) + agents
@@ -369,15 +327,14 @@ class ExternalStepping(BatchedEnvironment):
             raise InvalidInput(f"{self._described(rows, row)} reports twice before its action")
         if (left := self._has_left[envs, agents]).any():
             raise InvalidInput(f"{self._described(rows, int(np.argmax(left)))} reports after it has left")
-        acts = ~(rows.terminated | rows.truncated)
+        acts = ~rows.has_ended
         # The reward of one that leaves at the start could be counted for the episode before.
         if (early := ~acts & ~self._has_acted[envs]).any():
             raise InvalidInput(f"{self._described(rows, int(np.argmax(early)))} leaves before anybody has acted")
-        layout = message.layout
-        if acts.any():
-            self._acting[layout].append(rows if acts.all() else rows.rows(np.flatnonzero(acts)))
-        if not acts.all():
-            self._ended[layout].append(rows.rows(np.flatnonzero(~acts)))
+        for waiting, indices in ((self._acting, np.flatnonzero(acts)), (self._ended, np.flatnonzero(~acts))):
+            if len(indices):
+                part = rows if len(indices) == len(episodes) else rows.take(indices)
+                waiting[layout].append((episodes.take(indices), part))
         self._must_act[envs, agents] = self._is_present[envs, agents] = acts
         self._has_left[envs, agents] = ~acts
         reported = envs[np.isfinite(self._waiting_since[envs])]
@@ -386,8 +343,8 @@ class ExternalStepping(BatchedEnvironment):
             self._seconds[reported] += perf_counter() - self._waiting_since[reported]
             self._waiting_since[reported] = np.inf
 
-    def _described(self, rows: _Rows, row: int) -> str:
-        return f"agent {self.agents[rows.agents[row]]} of episode {rows.episodes[row]}"
+    def _described(self, rows: AgentRows, row: int) -> str:
+        return f"agent {self.agents[rows.agents[row]]} of episode {self._episodes[rows.envs[row]]}"
 
     def _finish(self, link: SimulatorLink, env: int) -> None:
         episode = self._episodes[env]
@@ -465,25 +422,22 @@ class ExternalStepping(BatchedEnvironment):
             self._enqueue(env)
 
     def _drop_rows(self, episode: int) -> None:
-        for kept in (self._acting, self._ended):
-            for layout in list(kept):
-                parts = [part.rows(np.flatnonzero(part.episodes != episode)) for part in kept[layout]]
-                kept[layout] = [part for part in parts if len(part.envs)]
-                if not kept[layout]:
-                    del kept[layout]
+        for waiting in (self._acting, self._ended):
+            for layout, parts in list(waiting.items()):
+                remaining = [(np.flatnonzero(episodes != episode), episodes, rows) for episodes, rows in parts]
+                waiting[layout] = [(episodes[kept], rows.take(kept)) for kept, episodes, rows in remaining if len(kept)]
+                if not waiting[layout]:
+                    del waiting[layout]
 
     def _collected(self) -> Turn:
-        turn = Turn(finished=_sorted(self._finished), crashed=_sorted(self._lost))
-        turn.endings = [_Rows.joined(parts).last_reports() for _, parts in sorted(self._ended.items())]
-        batches: dict[int, Batch] = {}
-        for parts in self._acting.values():
-            rows = _Rows.joined(parts)
+        acting, ended = (
+            [AgentRows.joined([rows for _, rows in parts]) for _, parts in sorted(waiting.items())]
+            for waiting in (self._acting, self._ended)
+        )
+        for rows in acting:
             self._is_shown[rows.envs] = True
-            groups = self._groups[rows.envs, rows.agents]
-            for group in np.unique(groups).tolist():
-                of_group = rows.rows(np.flatnonzero(groups == group))
-                batches[group] = Batch(of_group.envs, of_group.agents, dict(of_group.observations), of_group.rewards)
-        turn.batches = self._pending = {group: batches[group] for group in sorted(batches)}
+        self._pending = self._batches([[rows] for rows in acting])
+        turn = Turn(self._pending, ended, _sorted(self._finished), _sorted(self._lost))
         self._acting, self._ended, self._finished = defaultdict(list), defaultdict(list), []
         return turn
 

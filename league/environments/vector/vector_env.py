@@ -43,14 +43,14 @@ class AgentRows:
         return self.terminations | self.truncations
 
     @staticmethod
-    def concatenated(blocks: Sequence["AgentRows"]) -> "AgentRows":
-        """Return the rows of blocks with the same observation space, one block after the other."""
+    def joined(blocks: Sequence["AgentRows"]) -> "AgentRows":
+        """Return the rows of blocks with the same observation space, sorted by environment, then by agent."""
         observations = {
             name: np.concatenate([block.observations[name] for block in blocks]) for name in blocks[0].observations
         }
         columns = [(rows.envs, rows.agents, rows.rewards, rows.terminations, rows.truncations) for rows in blocks]
         envs, agents, *reports = map(np.concatenate, zip(*columns, strict=True))
-        return AgentRows(envs, agents, observations, *reports)
+        return AgentRows(envs, agents, observations, *reports).take(np.lexsort((agents, envs)))
 
     def take(self, chosen: NDArray[np.int64]) -> "AgentRows":
         """Return some of the rows, in the given order."""
