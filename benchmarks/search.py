@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import Quick, Target
 from league.environments.vector.connect_four import COLUMNS, ConnectFour
-from league.environments.vector.copying import acting
-from league.environments.vector.random_actions import legal_actions
+from league.environments.vector.random_actions import acting, legal_actions
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.policies.graph_runs import open_session
 from league.policies.policy import Arrays

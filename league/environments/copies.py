@@ -2,7 +2,6 @@
 
 import logging
 from abc import ABC, abstractmethod
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
@@ -14,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
-from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for, splitter
+from league.environments.adapters import EnvAdapter, Report, adapter_for, splitter
 from league.environments.building import agent_interface, build
 from league.environments.stepping import Batch, Indices, no_envs
+from league.environments.vector.columns import agent_rows
 from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.errors import EnvironmentMismatch, InvalidReturn, LeagueError, ObservationError, no_exit, one_line
+from league.errors import EnvironmentMismatch, InvalidReturn, LeagueError, no_exit, one_line
 from league.interface import AgentInterface
 from league.spaces import inputs
 from league.spaces.arrays import environment_actions
@@ -153,6 +153,7 @@ class StockCopies(Copies):
             interfaces = {agent: agent_interface(envs[0], agent) for agent in envs[0].possible_agents}
             super().__init__(interfaces, num_envs)
             self._splits = [splitter(spaces.observation) for spaces in interfaces.values()]
+            self._rows = partial(agent_rows, self.agents, self.inputs, self.first_alike)
             self._envs: list[EnvAdapter] = [adapter_for(env, self._splits) for env in envs]
             created.pop_all()
         self._make, self._make_of_seed, self._most_crashes = make, make_of_seed, most_crashes
@@ -163,7 +164,7 @@ class StockCopies(Copies):
         for env in envs.tolist():
             while (reports := self._call(env, self._reset, env)) is None:
                 pass
-            started[env] = [report for report in reports if not (report[3] or report[4])]
+            started[env] = reports
         return self._rows(started)
 
     def step(
@@ -237,38 +238,3 @@ class StockCopies(Copies):
         self.busy = NOBODY
         self._envs[env].close()
         self._envs[env] = adapter_for(self._make(), self._splits)
-
-    def _rows(self, reports: Mapping[int, list[Report] | None]) -> list[AgentRows]:
-        """Return the reports of environments in columns, in a block for each observation space."""
-        blocks: dict[int, list[tuple[int, Report]]] = defaultdict(list)
-        for env, env_reports in reports.items():
-            for report in env_reports or ():
-                blocks[self.first_alike[report[0]]].append((env, report))
-        return [self._block(blocks[first]) for first in sorted(blocks)]
-
-    def _block(self, rows: Sequence[tuple[int, Report]]) -> AgentRows:
-        agents, observations, rewards, terminations, truncations = zip(*(report for _, report in rows), strict=True)
-        return AgentRows(
-            np.array([env for env, _ in rows], dtype=np.int64),
-            np.array(agents, dtype=np.int64),
-            self._stacked(agents, observations),
-            np.array(rewards, dtype=np.float64),
-            np.array(terminations, dtype=bool),
-            np.array(truncations, dtype=bool),
-        )
-
-    def _stacked(self, agents: Sequence[int], observations: Sequence[Observation]) -> dict[str, NDArray]:
-        stacked = {}
-        for name, leaf in self.inputs[agents[0]].items():
-            try:
-                stacked[name] = np.array([row[name] for row in observations], dtype=leaf.dtype)
-            except (TypeError, ValueError):
-                stacked[name] = np.zeros(0)
-            if stacked[name].shape != (len(agents), *leaf.shape):
-                shapes = [np.shape(row[name]) for row in observations]
-                number = next((i for i, shape in enumerate(shapes) if shape != leaf.shape), 0)
-                raise ObservationError(
-                    f"agent {self.agents[agents[number]]} observes {name} with shape {list(shapes[number])}, but its"
-                    f" space has {list(leaf.shape)}"
-                )
-        return stacked

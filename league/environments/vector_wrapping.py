@@ -127,7 +127,7 @@ class WrappedVectorEnv(VectorEnv):
 
     def _wrapped(self, blocks: Sequence[AgentRows]) -> Sequence[AgentRows]:
         """Change the rows, and join those of agents whose spaces have become equal."""
-        joined: dict[int, list[AgentRows]] = {}
+        changed_blocks = []
         for rows in blocks:
             if not len(rows.envs):
                 continue
@@ -140,9 +140,8 @@ class WrappedVectorEnv(VectorEnv):
                 for observation_transform in transforms:
                     changed = observation_transform(changed, slots)
                 observations = {OBSERVATION: changed.astype(self._dtypes[agent], copy=False)}
-            changed_rows = replace(rows, rewards=rewards, observations=observations)
-            joined.setdefault(self._first_after[agent], []).append(changed_rows)
-        return [blocks[0] if len(blocks) == 1 else AgentRows.joined(blocks) for _, blocks in sorted(joined.items())]
+            changed_blocks.append(replace(rows, rewards=rewards, observations=observations))
+        return AgentRows.of_spaces(changed_blocks, self._first_after)
 
 
 def wrapped_vector(make: MakeVectorEnv, config: EnvironmentConfig) -> MakeVectorEnv:

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
 from league.environments.implementation import implementation
-from league.environments.vector.copying import LONGEST, Twins, acting
+from league.environments.vector.copying import LONGEST, Twins
 from league.environments.vector.differences import EnvironmentsDiffer
-from league.environments.vector.random_actions import legal_actions
+from league.environments.vector.random_actions import random_steps
 from league.environments.vector.vector_env import VectorEnv
 from league.errors import EnvironmentMismatch, ObservationError
 from league.interface import Interface
@@ -40,20 +40,17 @@ def searchable(config: EnvironmentConfig, interface: Interface) -> Callable[[int
         raise _refused(config, "the agents do not have the same discrete actions")
     make: Callable[[int], VectorEnv] = partial(choice.vector, **config.kwargs)
     twins = Twins(make, actions)
-    try:
-        twins.check_copying()
-    except EnvironmentsDiffer as difference:
-        raise _refused(config, f"its VectorEnv.copy does not copy everything: {difference}") from difference
-    try:
-        twins.check_without_chance()
-    except EnvironmentsDiffer as difference:
-        raise _refused(config, f"its games depend on chance: {difference}") from difference
-    try:
-        twins.check_restoring()
-    except NotImplementedError as error:
-        raise _refused(config, "its vectorised environment does not implement VectorEnv.restore") from error
-    except (EnvironmentsDiffer, ObservationError) as error:
-        raise _refused(config, f"its observations do not show everything: {error}") from error
+    for check, method, fault in (
+        (twins.check_copying, "copy", "its VectorEnv.copy does not copy everything"),
+        (twins.check_without_chance, "step", "its games depend on chance"),
+        (twins.check_restoring, "restore", "its observations do not show everything"),
+    ):
+        try:
+            check()
+        except NotImplementedError as error:
+            raise _refused(config, f"its vectorised environment does not implement VectorEnv.{method}") from error
+        except (EnvironmentsDiffer, ObservationError) as error:
+            raise _refused(config, f"{fault}: {error}") from error
     returns = _returns(make(GAMES), actions)
     if (np.abs(returns.sum(axis=1)) > ROUNDING).any() or (np.abs(returns) > 1 + ROUNDING).any():
         raise _refused(config, "the returns of its agents are not from -1 to 1 with the sum 0")
@@ -63,13 +60,10 @@ def searchable(config: EnvironmentConfig, interface: Interface) -> Callable[[int
 def _returns(env: VectorEnv, actions: Sequence[Space]) -> NDArray[np.float64]:
     """Return the returns of all agents in random games, (copies, agents)."""
     rng, copies = np.random.default_rng(0), np.arange(env.num_envs)
-    returns, steps = np.zeros((env.num_envs, len(actions))), 0
-    rows = env.reset(copies, copies)
-    while len(copies := acting(rows)) and steps < LONGEST:
-        rows = env.step(copies, legal_actions(rows, actions, rng))
+    returns = np.zeros((env.num_envs, len(actions)))
+    for rows in random_steps(env.step, env.reset(copies, copies), actions, rng, LONGEST):
         for block in rows:
             returns[block.envs, block.agents] += block.rewards
-        steps += 1
     return returns
 
 

@@ -6,12 +6,13 @@ same actions each time.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from league.environments.vector.differences import RowNames, check_column, check_rows
-from league.environments.vector.random_actions import legal_actions
+from league.environments.vector.differences import RowNames, check_reports, check_states
+from league.environments.vector.random_actions import acting, acting_rows, random_steps
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.spaces import Space
 
@@ -19,7 +20,7 @@ ROUNDS, COPIES = 8, 32
 LONGEST = 500
 """Steps after which a comparison ends."""
 
-Repeat = Callable[[NDArray[np.int64], NDArray[np.int64], Sequence[AgentRows]], None]
+Repeat = Callable[[NDArray[np.int64], NDArray[np.int64], Sequence[AgentRows]], object]
 
 
 class Twins:
@@ -36,68 +37,49 @@ class Twins:
 
     def check_copying(self) -> None:
         """Check that copied episodes continue identically."""
-        for _ in range(ROUNDS):
-            self._check("the copied episode", lambda copies, twins, _: self._env.copy(copies, twins))
+        self._check("the copied episode", lambda copies, twins, _: self._env.copy(copies, twins))
 
     def check_restoring(self) -> None:
         """Check that episodes that are restored from observations continue identically.
 
         Raises also NotImplementedError, and ObservationError if a position of a game is not accepted.
         """
-        for _ in range(ROUNDS):
-            self._check("the restored episode", self._restore)
+        self._check(
+            "the restored episode",
+            lambda _, twins, rows: [self._env.restore(twins, block.observations) for block in rows],
+        )
 
     def check_without_chance(self) -> None:
         """Check that the same actions have the same outcome with each seed."""
-        for _ in range(ROUNDS):
-            self._check("the episode with another seed")
-
-    def _restore(self, _: NDArray[np.int64], twins: NDArray[np.int64], rows: Sequence[AgentRows]) -> None:
-        for block in rows:
-            self._env.restore(twins, block.observations)
+        self._check("the episode with another seed")
 
     def _check(self, other: str, repeat: Repeat | None = None) -> None:
         """repeat: called with copies, their twins and the rows of the copies. None: the twins start alike."""
         env, every = self._env, np.arange(2 * COPIES)
-        seeds = self._rng.integers(2**31, size=len(every))
-        where = RowNames(env.possible_agents, seeds, np.zeros(len(every), dtype=np.int64), other)
-        rows: Sequence[AgentRows] = env.reset(every, seeds)
-        copies = every[:COPIES]
-        if repeat is None:
-            self._compare(copies, _of(rows, copies), _of(rows, copies + COPIES), where)
-            rows = _of(rows, copies)
-        else:
-            for _ in range(self._rng.integers(self._length)):
-                rows = env.step(acting(rows), legal_actions(rows, self._actions, self._rng))
-                if not len(acting(rows)):
-                    break
-            rows = _of(rows, copies)
-            copies = acting(rows)
-            repeat(copies, copies + COPIES, rows)
-        steps = 0
-        while len(copies) and steps < LONGEST:
-            drawn = legal_actions(rows, self._actions, self._rng)
-            where.steps[copies] += 1
-            rows, twins = (env.step(ids, drawn.copy()) for ids in (copies, copies + COPIES))
-            self._compare(copies, rows, twins, where)
-            copies, steps = acting(rows), steps + 1
-        self._length = max(self._length, steps)
+        for _ in range(ROUNDS):
+            seeds, copies = self._rng.integers(2**31, size=len(every)), every[:COPIES]
+            where = RowNames(env.possible_agents, seeds, np.zeros(len(every), dtype=np.int64), other)
+            every_row: Sequence[AgentRows] = env.reset(every, seeds)
+            if repeat is not None:
+                length = int(self._rng.integers(self._length))
+                *_, every_row = every_row, *random_steps(env.step, every_row, self._actions, self._rng, length)
+            rows = acting_rows(every_row, copies)
+            if repeat is None:
+                self._compare(where, copies, rows, acting_rows(every_row, copies + COPIES))
+            else:
+                repeat(acting(rows), acting(rows) + COPIES, rows)
+            step = partial(self._step, where)
+            steps = sum(1 for _ in random_steps(step, rows, self._actions, self._rng, LONGEST))
+            self._length = max(self._length, steps)
+
+    def _step(self, where: RowNames, copies: NDArray[np.int64], actions: NDArray) -> Sequence[AgentRows]:
+        where.steps[copies] += 1
+        rows, twins = (self._env.step(ids, actions.copy()) for ids in (copies, copies + COPIES))
+        self._compare(where, copies, rows, twins)
+        return rows
 
     def _compare(
-        self, copies: NDArray[np.int64], rows: Sequence[AgentRows], twins: Sequence[AgentRows], where: RowNames
+        self, where: RowNames, copies: NDArray[np.int64], rows: Sequence[AgentRows], twins: Sequence[AgentRows]
     ) -> None:
-        for block, twin in zip(rows, twins, strict=True):
-            check_rows(replace(twin, envs=twin.envs - COPIES), block, where)
-        state, twin_state = self._env.state(copies), self._env.state(copies + COPIES)
-        if state is not None and twin_state is not None:
-            check_column("state", twin_state, state, lambda row: where.text(int(copies[row])), where.other)
-
-
-def acting(rows: Sequence[AgentRows]) -> NDArray[np.int64]:
-    """Return the copies in which an agent must act, ascending."""
-    return np.unique(np.concatenate([block.envs[~block.has_ended] for block in rows]))
-
-
-def _of(rows: Sequence[AgentRows], copies: NDArray[np.int64]) -> list[AgentRows]:
-    """Return the rows of some copies, without those of agents that have left."""
-    return [block.take(np.flatnonzero(np.isin(block.envs, copies) & ~block.has_ended)) for block in rows]
+        check_reports([replace(twin, envs=twin.envs - COPIES) for twin in twins], rows, where)
+        check_states(self._env.state(copies + COPIES), self._env.state(copies), where, copies)

@@ -1,7 +1,8 @@
 """Compares reports of a vectorised environment with those of another, bit for bit."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from league.environments.vector.vector_env import AgentRows
 
 STOCK = "the stock environment"
+COLUMNS = ("envs", "agents", "rewards", "terminations", "truncations")
 
 
 class EnvironmentsDiffer(Exception):
@@ -24,50 +26,60 @@ class RowNames:
     steps: NDArray[np.int64]
     other: str = STOCK
 
-    def text(self, env: int, agent: int | None = None) -> str:
+    def text(self, env: int, *agents: int) -> str:
         copy = f"copy {env}, seed {self.seeds[env]}, step {self.steps[env]}"
-        return copy if agent is None else f"{copy}, {self.agents[agent]}"
+        return ", ".join([copy, *(self.agents[agent] for agent in agents)])
 
 
-def check_rows(stock: AgentRows, vector: AgentRows, where: RowNames) -> None:
-    """Raise EnvironmentsDiffer unless all columns are equal."""
-    if not (np.array_equal(stock.envs, vector.envs) and np.array_equal(stock.agents, vector.agents)):
-        stock_pairs, vector_pairs = (
-            list(zip(rows.envs.tolist(), rows.agents.tolist(), strict=True)) for rows in (stock, vector)
+def check_reports(expected: Sequence[AgentRows], reported: Sequence[AgentRows], where: RowNames) -> None:
+    """Raise EnvironmentsDiffer unless both have the same blocks, and all columns of these are equal."""
+    if len(reported) != len(expected):
+        raise EnvironmentsDiffer(
+            f"{len(reported)} AgentRows have rows, expected {len(expected)}: one per observation space"
         )
-        differing = (row for row, pair in enumerate(stock_pairs) if vector_pairs[row : row + 1] != [pair])
-        row = next(differing, len(stock_pairs))
-        has = f"of copy {vector_pairs[row][0]}, agent {vector_pairs[row][1]}" if row < len(vector_pairs) else "missing"
-        should = f"of {where.text(*stock_pairs[row])}" if row < len(stock_pairs) else "missing"
-        raise EnvironmentsDiffer(f"row {row} is {has}, in {where.other} {should}")
+    for stock, vector in zip(expected, reported, strict=True):
+        _check_rows(stock, vector, where)
+
+
+def check_states(expected: NDArray | None, state: NDArray | None, where: RowNames, envs: NDArray[np.int64]) -> None:
+    """Raise EnvironmentsDiffer unless the states of the copies `envs` are equal, or both environments have none."""
+    if expected is not None and state is not None:
+        _check_column("state", expected, state, where, envs)
+    elif expected is not state:
+        raise EnvironmentsDiffer(
+            "the environment has no state, but the stock environment has one"
+            if state is None
+            else "the environment has a state, the stock environment has none"
+        )
+
+
+def _check_rows(stock: AgentRows, vector: AgentRows, where: RowNames) -> None:
+    if not (np.array_equal(stock.envs, vector.envs) and np.array_equal(stock.agents, vector.agents)):
+        pairs = [list(zip(rows.envs.tolist(), rows.agents.tolist(), strict=True)) for rows in (vector, stock)]
+        row, (has, should) = next(pair for pair in enumerate(zip_longest(*pairs)) if pair[1][0] != pair[1][1])
+        raise EnvironmentsDiffer(
+            f"row {row} is {f'of copy {has[0]}, agent {has[1]}' if has else 'missing'}, in {where.other}"
+            f" {f'of {where.text(*should)}' if should else 'missing'}"
+        )
     if vector.observations.keys() != stock.observations.keys():
         raise EnvironmentsDiffer(
             f"observations are {', '.join(vector.observations)}, in {where.other} {', '.join(stock.observations)}"
         )
-
-    def name(row: int) -> str:
-        return where.text(int(stock.envs[row]), int(stock.agents[row]))
-
-    for column in ("envs", "agents", "rewards", "terminations", "truncations"):
-        check_column(column, getattr(stock, column), getattr(vector, column), name, where.other)
-    for column, values in stock.observations.items():
-        check_column(column, values, vector.observations[column], name, where.other)
+    columns = [(name, getattr(stock, name), getattr(vector, name)) for name in COLUMNS]
+    observations = [(name, values, vector.observations[name]) for name, values in stock.observations.items()]
+    for column, values, vector_values in columns + observations:
+        _check_column(column, values, vector_values, where, stock.envs, stock.agents)
 
 
-def check_column(column: str, stock: NDArray, vector: NDArray, name: Callable[[int], str], other: str = STOCK) -> None:
-    """Raise EnvironmentsDiffer unless two arrays (k, …) have the same dtype, shape and bits."""
-    if (vector.dtype, vector.shape) != (stock.dtype, stock.shape):
-        raise EnvironmentsDiffer(
-            f"{name(0)}: {column} is {vector.dtype}{list(vector.shape)}, in {other} {stock.dtype}{list(stock.shape)}"
-        )
-    if stock.tobytes() == vector.tobytes():
+def _check_column(column: str, stock: NDArray, vector: NDArray, where: RowNames, *ids: NDArray[np.int64]) -> None:
+    """Raise EnvironmentsDiffer unless two arrays (k, …) have the same dtype, shape and bits. ids: the names of rows."""
+    if (vector.dtype, vector.shape) == (stock.dtype, stock.shape) and vector.tobytes() == stock.tobytes():
         return
-    differs = (_bits(stock) != _bits(vector)).any(axis=-1)
-    row, *index = np.argwhere(differs)[0].tolist()
-    vector_value, stock_value = (array[(row, *index)].item() for array in (vector, stock))
-    raise EnvironmentsDiffer(f"{name(row)}: {column}{index or ''} is {vector_value!r}, in {other} {stock_value!r}")
-
-
-def _bits(array: NDArray) -> NDArray[np.uint8]:
-    """The bytes of each element, (…, itemsize)."""
-    return np.ascontiguousarray(array)[..., np.newaxis].view(np.uint8)
+    row, index = 0, []
+    values = [f"{array.dtype}{list(array.shape)}" for array in (vector, stock)]
+    if values[0] == values[1]:
+        bits = [np.ascontiguousarray(array)[..., np.newaxis].view(np.uint8) for array in (vector, stock)]
+        row, *index = np.argwhere((bits[0] != bits[1]).any(axis=-1))[0].tolist()
+        values = [repr(array[(row, *index)].item()) for array in (vector, stock)]
+    name = where.text(*(int(array[row]) for array in ids))
+    raise EnvironmentsDiffer(f"{name}: {column}{index or ''} is {values[0]}, in {where.other} {values[1]}")

@@ -1,6 +1,6 @@
-"""Random legal actions for many agents at once."""
+"""Random legal actions for many agents at once, and random play of vectorised environments."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,14 +46,47 @@ def random_actions(space: Space, count: int, mask: NDArray | None, rng: np.rando
 def legal_actions(rows: Sequence[AgentRows], actions: Sequence[Space], rng: np.random.Generator) -> NDArray:
     """Draw legal actions for all rows that must act, in the order of `VectorEnv.step`. actions: space of each agent."""
     drawn, places = [], []
-    for block in rows:
-        acting = np.flatnonzero(~block.has_ended)
+    for block in acting_rows(rows):
         mask = block.observations.get(ACTION_MASK)
-        for agent in np.unique(block.agents[acting]).tolist():
-            indices = acting[block.agents[acting] == agent]
+        for agent in np.unique(block.agents).tolist():
+            indices = np.flatnonzero(block.agents == agent)
             drawn.append(random_actions(actions[agent], len(indices), None if mask is None else mask[indices], rng))
             places.append(block.envs[indices] * len(actions) + agent)
     return np.concatenate(drawn)[np.argsort(np.concatenate(places), kind="stable")]
+
+
+def random_steps(
+    step: Callable[[NDArray[np.int64], NDArray], Sequence[AgentRows]],
+    rows: Sequence[AgentRows],
+    actions: Sequence[Space],
+    rng: np.random.Generator,
+    most: int,
+) -> Iterator[Sequence[AgentRows]]:
+    """Step all copies in which an agent must act, until there is none, and yield the rows of each step.
+
+    Args:
+        step: As of VectorEnv.
+        rows: The newest rows of the copies.
+        actions: Action space of each agent.
+        rng: Draws the actions.
+        most: Maximum number of steps.
+    """
+    for _ in range(most):
+        if not len(copies := acting(rows)):
+            return
+        rows = step(copies, legal_actions(rows, actions, rng))
+        yield rows
+
+
+def acting(rows: Sequence[AgentRows]) -> NDArray[np.int64]:
+    """Return the copies in which an agent must act, ascending."""
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(block.envs[~block.has_ended] for block in rows)]))
+
+
+def acting_rows(rows: Sequence[AgentRows], copies: NDArray[np.int64] | None = None) -> list[AgentRows]:
+    """Return the rows of agents that must act, in some copies or in all, without empty blocks."""
+    masks = [~block.has_ended & (copies is None or np.isin(block.envs, copies)) for block in rows]
+    return [block.take(np.flatnonzero(mask)) for block, mask in zip(rows, masks, strict=True) if mask.any()]
 
 
 def random_choices(mask: NDArray, rng: np.random.Generator) -> NDArray[np.int64]:

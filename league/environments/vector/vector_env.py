@@ -5,7 +5,8 @@ seeds and actions both report the same, bit for bit.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +42,17 @@ class AgentRows:
     def has_ended(self) -> NDArray[np.bool_]:
         """Whether each row is the last one of its agent, (k,)."""
         return self.terminations | self.truncations
+
+    @staticmethod
+    def of_spaces(blocks: Iterable["AgentRows"], first_alike: Sequence[int]) -> list["AgentRows"]:
+        """Return one block for each observation space.
+
+        blocks: none of them empty. first_alike: the first agent with the same observation space, of each agent.
+        """
+        alike: dict[int, list[AgentRows]] = defaultdict(list)
+        for block in blocks:
+            alike[first_alike[block.agents[0]]].append(block)
+        return [rows[0] if len(rows) == 1 else AgentRows.joined(rows) for _, rows in sorted(alike.items())]
 
     @staticmethod
     def joined(blocks: Sequence["AgentRows"]) -> "AgentRows":

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
 from league.environments.vector.equality import DifferentialTest
+from league.environments.vector.random_actions import acting_rows
 from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.spaces import Box, Discrete, Space
+from league.spaces import ACTION_MASK, Box, Discrete, Space
 
 MAX_COPIES = 4
 
@@ -82,11 +83,20 @@ def last_rows(config: EnvironmentConfig, vector: VectorEnv, actions: list[int], 
 def chosen_actions(test: DifferentialTest, env_ids: NDArray[np.int64], choices: Iterator[int]) -> NDArray:
     return np.array(
         [
-            chosen_action(test.action_space(agent), mask, choices)
+            chosen_action(test.actions[agent], mask, choices)
             for env in env_ids.tolist()
-            for agent, mask in test.legal(env)
+            for agent, mask in legal(test, env)
         ]
     )
+
+
+def legal(test: DifferentialTest, env: int) -> list[tuple[int, NDArray | None]]:
+    """Return the agents of a copy that must act, with their masks (n,); None for agents without a mask."""
+    agents = {}
+    for block in acting_rows(test.acting, np.array([env])):
+        masks = block.observations.get(ACTION_MASK, [None] * len(block.envs))
+        agents.update(zip(block.agents.tolist(), masks, strict=True))
+    return sorted(agents.items())
 
 
 def chosen_action(space: Space, mask: NDArray | None, choices: Iterator[int]) -> int | NDArray:

@@ -39,7 +39,6 @@ def test_an_equal_environment_has_no_difference(name: str) -> None:
     assert comparison.difference is None
     assert 150 <= comparison.steps < 153
     assert comparison.episodes > 5
-    assert comparison.vector_rate > 0
     assert comparison.stock_rate > 0
 
 
