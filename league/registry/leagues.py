@@ -1,6 +1,5 @@
 """Registered leagues. The row of a league is the lock that serialises all changes to the league."""
 
-import difflib
 import json
 import logging
 from contextlib import suppress
@@ -12,7 +11,7 @@ from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
 from league.conditions import ActionSelection, Conditions, action_selection, default_selection, game_changes
-from league.errors import InterfaceChanged, UnknownLeague
+from league.errors import InterfaceChanged, UnknownLeague, did_you_mean
 from league.interface import Interface, digest
 from league.refs import check_new
 from league.registry.storage import change_counter
@@ -225,5 +224,5 @@ def _describe_changes(before: dict[str, Any], now: dict[str, Any]) -> str:
 
 def _unknown(session: Session, league: str) -> LeagueRow:
     slugs = list(session.scalars(select(LeagueRow.slug).order_by(LeagueRow.slug)))
-    guess = "".join(f", did you mean {name!r}?" for name in difflib.get_close_matches(league, slugs, n=1))
+    guess = did_you_mean(league, slugs)
     raise UnknownLeague(f"there is no league {league!r}{guess or '; known: ' + (', '.join(slugs) or 'none yet')}")
