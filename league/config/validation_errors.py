@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from league.errors import one_line
@@ -31,6 +30,8 @@ TYPES = {
 
 def describe_yaml_error(error: Exception) -> str:
     """Return why a file is not YAML, and the line. PyYAML also raises ValueError and RecursionError."""
+    import yaml  # manifests are described without it
+
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None and error.problem:
         return f"line {error.problem_mark.line + 1}: not valid YAML: {error.problem}"
     return f"not a YAML file: {one_line(error)}"
