@@ -115,9 +115,9 @@ def test_what_a_simulator_sends(message: dict[str, Any]) -> None:
 def flattened(read: Reports | Abandoned) -> list[Any]:
     assert isinstance(read, Reports)
     rows = []
-    for part in read.rows:
-        columns = part.episodes, part.agents, part.rewards, part.terminated, part.truncated
-        for i in range(len(part.episodes)):
+    for _, part in read.rows:
+        columns = part.envs, part.agents, part.rewards, part.terminations, part.truncations
+        for i in range(len(part.envs)):
             observations = [(name, array[i].tolist()) for name, array in part.observations.items()]
             rows.append(([column[i].item() for column in columns], observations))
     return sorted(rows)
