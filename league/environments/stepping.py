@@ -86,11 +86,6 @@ class Batch:
             self.rewards.take(rows),
         )
 
-    def part(self, rows: slice) -> "Batch":
-        """Return a batch of consecutive rows, which shares their memory."""
-        observations = {name: array[rows] for name, array in self.observations.items()}
-        return Batch(self.envs[rows], self.agents[rows], observations, self.rewards[rows])
-
 
 @dataclass(frozen=True, slots=True)
 class Ending:
