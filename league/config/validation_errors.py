@@ -1,11 +1,11 @@
 """Errors of a configuration in one line, with the keys and the expected values."""
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
 from pydantic import ValidationError
+from pydantic_core import from_json
 
 from league.errors import one_line
 
@@ -44,7 +44,7 @@ def describe_validation_error(error: ValidationError, document: Any) -> str:
     """
     if isinstance(document, str | bytes):
         with suppress(ValueError):
-            document = json.loads(document)
+            document = from_json(document)
     # A value that has none of several types is one fault, unless one of them says more.
     faults: dict[str, tuple[str, list[str]]] = {}
     for detail in error.errors():

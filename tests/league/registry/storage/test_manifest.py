@@ -86,6 +86,7 @@ def test_written_probabilities_are_normalised() -> None:
 
 
 FAULTY = (
+    ("[" * 100_000, "file: not valid JSON: recursion limit exceeded"),
     ('{"league": "board"', "file: not valid JSON: EOF while parsing an object at line 1 column 18"),
     ("[]", "file: expected a mapping, got []"),
     ('{"league": 5}', "league: expected a string, got 5; version: missing, but required; "),
