@@ -7,9 +7,10 @@ and algorithm; the openings are those that were measured.
 import glob
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import prod
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,44 @@ PLAIN = re.compile(r"[A-Za-z_][\w.:/-]*", re.ASCII)
 """Texts that need no quotes in YAML, except words such as `yes`."""
 WIDE = 10.0
 """Numbers beyond ± this value are normalised."""
+TEMPLATE = """\
+# Written by `league init`. docs/configuration.md describes all settings.
+league: $league  # name in all commands and URLs
+folder: $folder  # where the code is searched, relative to this file
+
+environment:  # what is played
+  entry_point: $entry_point  # module or function that creates it
+  kwargs: $kwargs  # arguments of its constructor
+
+policies:  # policy → its agents; each policy is one network
+$policies
+
+$sides
+
+play:  # the games that are rated
+  actions: $actions  # $selection
+  opening_plies: $opening_plies  # random moves at the start; $openings
+
+training:  # league train
+  algorithm: ppo  # $algorithms
+  steps: 1_000_000  # budget: actions of all agents
+  minutes: null  # time limit; the earlier of the two ends training
+  checkpoint_every: 200_000  # actions between published versions
+  gamma: $gamma  # $discount
+  lr: $lr  # $rate
+  entropy: $entropy  # $exploration
+  convolutions: $convolutions  # for images in the observations
+  channels: $channels  # the images are $axes
+  hidden: [256, 256]  # widths of the hidden layers
+  normalize_observations: $normalized  # the bounds of observations are wide or infinite
+  opponents: $opponents  # such as {ref: script:random, share: 0.2}; else self-play
+
+gate:  # league nightly: the test for promotions
+  elo1: 30  # gain in Elo that the test should detect
+  max_blocks: 4000  # pairs of games after which a test ends undecided
+  anchors: []  # bots or versions that a new champion must hold its own against
+"""
+"""The file. Lines with an empty value are left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,26 +92,6 @@ class Proposal:
     text: str
     config: LeagueConfig
     examination: Examination
-
-
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """A line of the file: key and value with their indentation, and the comment. Empty: a blank line."""
-
-    text: str = ""
-    comment: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.text:<{COMMENT_COLUMN}}  # {self.comment}" if self.comment else self.text
-
-
-GATE = (
-    _Line(),
-    _Line("gate:", "league nightly: the test for promotions"),
-    _Line("  elo1: 30", "gain in Elo that the test should detect"),
-    _Line("  max_blocks: 4000", "pairs of games after which a test ends undecided"),
-    _Line("  anchors: []", "bots or versions that a new champion must hold its own against"),
-)
 
 
 def propose(
@@ -112,101 +131,82 @@ def propose(
     if team:
         one_side = examination.interface.model_copy(update={"sides": {"team": tuple(examination.interface.agents)}})
         examination.actions = describe_selection(config, one_side)
-    lines = [
-        *_header(config, environment, shown),
-        *_policies(examination.interface, team),
-        *_play(config, examination, examination.interface, team),
-        *_training(examination, examination.interface, team),
-        *GATE,
-    ]
-    text = "\n".join(map(str, lines)) + "\n"
+    text = _text(config, examination, examination.interface, team, shown)
     proposed = LeagueConfig.from_mapping(yaml.safe_load(text) | {"folder": document["folder"]}, source="the proposal")
     return Proposal(text, proposed, examination)
 
 
-def _header(config: LeagueConfig, environment: JSON, shown: str | None) -> Iterator[_Line]:
-    yield from (
-        _Line("# Written by `league init`. docs/configuration.md describes all settings."),
-        _Line(f"league: {config.league}", "name in all commands and URLs"),
-    )
-    if shown is not None:
-        yield _Line(f"folder: {_inline(shown)}", "where the code is searched, relative to this file")
-    entry_point = f"  entry_point: {_inline(environment['entry_point'])}"
-    yield from (
-        _Line(),
-        _Line("environment:", "what is played"),
-        _Line(entry_point, "module or function that creates it"),
-    )
-    if kwargs := environment.get("kwargs"):
-        yield _Line(f"  kwargs: {_inline(kwargs)}", "arguments of its constructor")
+def _text(
+    config: LeagueConfig, examination: Examination, interface: Interface, is_team: bool, shown: str | None
+) -> str:
+    """The file. See `propose`."""
+    values = {
+        "league": config.league,
+        "folder": "" if shown is None else _inline(shown),
+        "entry_point": _inline(config.environment.entry_point),
+        "kwargs": _inline(config.environment.kwargs) if config.environment.kwargs else "",
+        "policies": _policies(interface),
+        "sides": _sides(interface, is_team),
+        "opponents": "" if is_team else "[]",
+        **_play(config, examination, interface, is_team),
+        **_training(examination, interface, is_team),
+    }
+    templates = [Template(line) for line in TEMPLATE.splitlines()]
+    lines = [line.substitute(values) for line in templates if all(values[name] for name in line.get_identifiers())]
+    return "".join(f"{_aligned(line)}\n" for line in "\n".join(lines).split("\n"))
 
 
-def _policies(interface: Interface, is_team: bool) -> Iterator[_Line]:
-    yield from (_Line(), _Line("policies:", "policy → its agents; each policy is one network"))
+def _aligned(line: str) -> str:
+    text, mark, comment = line.rpartition("  # ")
+    return f"{text:<{COMMENT_COLUMN}}{mark}{comment}" if text else line
+
+
+def _policies(interface: Interface) -> str:
+    lines = []
     for policy in interface.policy_ids:
         policy_agents = [agent for agent in interface.agents if interface.policies[agent] == policy]
         space = interface.agents[policy_agents[0]].action
-        yield _Line(f"  {policy}: {_inline(_patterns(policy_agents, list(interface.agents)))}", _described(space))
-    yield _Line()
+        lines.append(f"  {policy}: {_inline(_patterns(policy_agents, list(interface.agents)))}  # {_described(space)}")
+    return "\n".join(lines)
+
+
+def _sides(interface: Interface, is_team: bool) -> str:
+    head = "sides:  # side → its agents; the sides are opponents\n"
     if is_team:
-        yield from (
-            _Line("sides:", "side → its agents; the sides are opponents"),
-            _Line('  team: ["*"]', "all agents are one team; without it, each is a side of its own"),
-        )
-    elif len(interface.sides) <= LISTED_AGENTS and all(map(SLUG.fullmatch, interface.sides)):
-        yield _Line("sides:", "side → its agents; the sides are opponents")
-        for side, agents in interface.sides.items():
-            yield _Line(f"  {_inline(side)}: {_inline(list(agents))}", "agents of one team belong to one side")
-    else:
-        yield _Line("sides: null", "each agent is a side of its own")
-
-
-def _play(config: LeagueConfig, examination: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
-    measured, reason = examination.openings, "the most likely ones; sampled if information is hidden"
-    actions = "greedy" if is_team else action_selection(config, interface)
-    if is_team:
-        reason = "the most likely ones, as there is no opponent"
-    elif actions == "sampled":
-        hides = interface.hidden_information
-        reason = f"drawn at random, as {'the environment hides information' if hides else 'opponents act at once'}"
-    yield from (_Line(), _Line("play:", "the games that are rated"), _Line(f"  actions: {actions}", reason))
-    opening = "random moves at the start"
-    if actions == "sampled":
-        yield _Line("  opening_plies: 0", f"{opening}; sampled actions vary the games")
-    elif measured is None:
-        yield _Line("  opening_plies: 0", f"{opening}; not measured, as the environment is slow")
-    else:
-        seeds = f"{measured.games} seeds alone: {measured.different_games} different"
-        yield _Line(f"  opening_plies: {measured.recommended}", f"{opening}; {seeds}")
-
-
-def _training(examination: Examination, interface: Interface, is_team: bool) -> Iterator[_Line]:
-    turns = examination.actions_per_episode
-    alternatives = _other_algorithms(interface, examination.api)
-    comment = f"also possible: {', '.join(alternatives)}" if alternatives else "the only one for these spaces"
-    yield from (
-        _Line(),
-        _Line("training:", "league train"),
-        _Line("  algorithm: ppo", comment),
-        _Line("  steps: 1_000_000", "budget: actions of all agents"),
-        _Line("  minutes: null", "time limit; the earlier of the two ends training"),
-        _Line("  checkpoint_every: 200_000", "actions between published versions"),
+        return f'{head}  team: ["*"]  # all agents are one team; without it, each is a side of its own'
+    if len(interface.sides) > LISTED_AGENTS or not all(map(SLUG.fullmatch, interface.sides)):
+        return "sides: null  # each agent is a side of its own"
+    return head + "\n".join(
+        f"  {_inline(side)}: {_inline(list(agents))}  # agents of one team belong to one side"
+        for side, agents in interface.sides.items()
     )
-    if turns is not None and turns <= SHORT_EPISODE:
-        most = "1 action" if turns == 1 else f"{turns} actions"
-        yield _Line("  gamma: 1.0", f"no discount: at most {most} of an agent per episode")
-    else:
-        yield _Line("  gamma: 0.99", "discount per action; smaller favours quick wins")
-    if interface.hidden_information and not is_team:
-        yield from (
-            _Line("  lr: {initial: 0.001, final: 0.0}", "learning rate, annealed as information is hidden"),
-            _Line("  entropy: {initial: 0.1, final: 0.02}", "exploration, annealed for the same reason"),
+
+
+def _play(config: LeagueConfig, examination: Examination, interface: Interface, is_team: bool) -> dict[str, str]:
+    measured, plies = examination.openings, 0
+    actions, selection = "greedy", "the most likely ones, as there is no opponent"
+    if not is_team:
+        actions, selection = (
+            action_selection(config, interface),
+            "the most likely ones; sampled if information is hidden",
         )
+    if actions == "sampled":
+        hides = interface.hidden_information
+        selection = f"drawn at random, as {'the environment hides information' if hides else 'opponents act at once'}"
+        openings = "sampled actions vary the games"
+    elif measured is None:
+        openings = "not measured, as the environment is slow"
     else:
-        yield from (
-            _Line("  lr: 0.0005", "learning rate of Adam"),
-            _Line("  entropy: 0.05", "exploration; less makes the policy decide sooner"),
-        )
+        plies = measured.recommended
+        openings = f"{measured.games} seeds alone: {measured.different_games} different"
+    return {"actions": actions, "selection": selection, "opening_plies": str(plies), "openings": openings}
+
+
+def _training(examination: Examination, interface: Interface, is_team: bool) -> dict[str, str]:
+    turns = examination.actions_per_episode
+    is_short = turns is not None and turns <= SHORT_EPISODE
+    anneals = interface.hidden_information and not is_team
+    alternatives = ", ".join(_other_algorithms(interface, examination.api))
     leaves = [
         leaf
         for spaces in interface.agents.values()
@@ -214,20 +214,27 @@ def _training(examination: Examination, interface: Interface, is_team: bool) -> 
         if name != ACTION_MASK
     ]
     images = [leaf.shape for leaf in leaves if isinstance(leaf, Box) and len(leaf.shape) == 3]
-    sizes = [min(shape[1:] if channels_of(shape) == "first" else shape[:2]) for shape in images]
-    if sizes and min(sizes) >= SMALL_BOARD:
-        axes = {channels_of(shape) for shape in images}
-        convolutions = IMAGE_CONVOLUTIONS if min(sizes) >= IMAGE else BOARD_CONVOLUTIONS
-        yield _Line(f"  convolutions: {_inline(convolutions)}", "for images in the observations")
-        if len(axes) == 1:
-            channels = axes.pop()
-            order = "(channels, height, width)" if channels == "first" else "(height, width, channels)"
-            yield _Line(f"  channels: {channels}", f"the images are {order}")
-    yield _Line("  hidden: [256, 256]", "widths of the hidden layers")
-    if any(map(_is_wide, leaves)):
-        yield _Line("  normalize_observations: true", "the bounds of observations are wide or infinite")
-    if not is_team:
-        yield _Line("  opponents: []", "such as {ref: script:random, share: 0.2}; else self-play")
+    axes = {channels_of(shape) for shape in images}
+    size = min((min(shape[1:] if channels_of(shape) == "first" else shape[:2]) for shape in images), default=0)
+    return {
+        "algorithms": f"also possible: {alternatives}" if alternatives else "the only one for these spaces",
+        "gamma": "1.0" if is_short else "0.99",
+        "discount": f"no discount: at most {turns} action{'s' * (turns != 1)} of an agent per episode"
+        if is_short
+        else "discount per action; smaller favours quick wins",
+        "lr": "{initial: 0.001, final: 0.0}" if anneals else "0.0005",
+        "rate": "learning rate, annealed as information is hidden" if anneals else "learning rate of Adam",
+        "entropy": "{initial: 0.1, final: 0.02}" if anneals else "0.05",
+        "exploration": "exploration, annealed for the same reason"
+        if anneals
+        else "exploration; less makes the policy decide sooner",
+        "convolutions": _inline(IMAGE_CONVOLUTIONS if size >= IMAGE else BOARD_CONVOLUTIONS)
+        if size >= SMALL_BOARD
+        else "",
+        "channels": next(iter(axes)) if size >= SMALL_BOARD and len(axes) == 1 else "",
+        "axes": "(channels, height, width)" if axes == {"first"} else "(height, width, channels)",
+        "normalized": "true" if any(map(_is_wide, leaves)) else "",
+    }
 
 
 def _patterns(own: list[str], agents: list[str]) -> list[str]:

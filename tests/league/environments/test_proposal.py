@@ -6,10 +6,11 @@ from typing import Any
 import pytest
 import yaml
 
+from league.config.environment import EnvironmentConfig
 from league.environments.building import divide
 from league.environments.conformance.findings import Examination
 from league.environments.conformance.openings import OpeningMeasurement
-from league.environments.conformance.proposal import _header, _inline, _play, _policies, _training, propose
+from league.environments.conformance.proposal import _inline, _text, propose
 from league.errors import ConfigError
 from league.interface import AgentInterface, Interface
 from league.spaces import Box, DictSpace, Discrete, MultiDiscrete
@@ -38,15 +39,21 @@ def examined(api: str = "AEC", actions: int | None = 100) -> Examination:
     return Examination(api=api, actions_per_episode=actions, openings=openings)
 
 
-def parsed(lines: Any) -> Any:
-    """The YAML of some lines, each of which has a comment."""
-    text = [str(line) for line in lines]
-    assert all(" # " in line for line in text if line)
-    return yaml.safe_load("\n".join(text))
+def proposed(
+    examination: Examination, described: Interface, *, is_team: bool = False, environment: Any = None
+) -> tuple[Any, list[str]]:
+    """The document of a file, and its lines."""
+    league = config()
+    if environment is not None:
+        league = league.model_copy(update={"environment": EnvironmentConfig.model_validate(environment)})
+    text = _text(league, examination, described, is_team, None)
+    lines = text.splitlines()
+    assert all(" # " in line for line in lines[1:] if line)
+    return yaml.safe_load(text), lines
 
 
-def training(found: Examination, *kinds: AgentInterface, hidden: bool = False) -> Any:
-    return parsed(_training(found, interface(*kinds, hidden=hidden), is_team=False))["training"]
+def training(examination: Examination, *kinds: AgentInterface, hidden: bool = False) -> Any:
+    return proposed(examination, interface(*kinds, hidden=hidden))[0]["training"]
 
 
 def test_the_network_fits_the_observations() -> None:
@@ -68,9 +75,10 @@ def test_the_network_fits_the_observations() -> None:
 def test_values_survive_yaml(tmp_path: Path) -> None:
     for value in ("a.b:c", "yes", "a: b", "..", "#", "", "a'b\"", {"game": "x", "n": [1, True]}, [None]):
         assert yaml.safe_load(f"key: {_inline(value)}  # comment") == {"key": value}
-    environment = {"entry_point": "openspiel", "kwargs": {"game": "kuhn_poker"}}
-    document = yaml.safe_load("\n".join(map(str, _header(config(), environment, None))))
-    assert document == {"league": "tictactoe", "environment": environment}
+    for game in ("kuhn_poker", "a  # b"):
+        environment = {"entry_point": "openspiel", "kwargs": {"game": game}}
+        document, _ = proposed(examined(), interface(spaces(), spaces()), environment=environment)
+        assert (document["league"], document["environment"]) == ("tictactoe", environment)
     with pytest.raises(ConfigError, match="nowhere_to_be_found"):
         propose("mine", "nowhere_to_be_found:make_env", {}, str(tmp_path))
 
@@ -84,13 +92,13 @@ def test_the_algorithm_fits_the_actions() -> None:
         ("AEC", box, "the only one for these spaces"),
         ("Parallel", MultiDiscrete(nvec=[2, 3], start=[0, 0], shape=(2,)), "the only one for these spaces"),
     ):
-        lines = list(map(str, _training(examined(api), interface(spaces(action), spaces(action)), is_team=False)))
+        _, lines = proposed(examined(api), interface(spaces(action), spaces(action)))
         assert next(line for line in lines if "algorithm: ppo" in line).endswith(remark)
 
 
 def test_episodes_and_hidden_information_decide_discount_and_annealing() -> None:
     for actions in (1, 5, 6, 100, None):
-        lines = map(str, _training(examined(actions=actions), interface(spaces(), spaces()), is_team=False))
+        _, lines = proposed(examined(actions=actions), interface(spaces(), spaces()))
         line = next(line for line in lines if "gamma" in line)
         is_short = actions in (1, 5)
         assert yaml.safe_load(line) == {"gamma": 1.0 if is_short else 0.99}
@@ -101,9 +109,9 @@ def test_episodes_and_hidden_information_decide_discount_and_annealing() -> None
 
 
 def test_measured_openings_are_used_unless_actions_are_sampled() -> None:
-    open_play = parsed(_play(config(), examined(), interface(spaces(), spaces()), is_team=False))["play"]
-    hidden = parsed(_play(config(), examined(), interface(spaces(), spaces(), hidden=True), is_team=False))["play"]
-    team = parsed(_play(config(), examined(), interface(spaces(), spaces(), hidden=True), is_team=True))["play"]
+    open_play = proposed(examined(), interface(spaces(), spaces()))[0]["play"]
+    hidden = proposed(examined(), interface(spaces(), spaces(), hidden=True))[0]["play"]
+    team = proposed(examined(), interface(spaces(), spaces(), hidden=True), is_team=True)[0]["play"]
     assert open_play == {"actions": "greedy", "opening_plies": 3}
     assert hidden == {"actions": "sampled", "opening_plies": 0}
     assert team == {"actions": "greedy", "opening_plies": 3}
@@ -111,14 +119,14 @@ def test_measured_openings_are_used_unless_actions_are_sampled() -> None:
 
 def test_policies_and_sides() -> None:
     two = interface(spaces(), spaces(Discrete(n=5)))
-    document = parsed(_policies(two, is_team=False))
+    document, _ = proposed(examined(), two)
     assert document["policies"] == {"policy_0": ["player_0"], "policy_1": ["player_1"]}
     assert document["sides"] == {"player_0": ["player_0"], "player_1": ["player_1"]}
     many = interface(*[spaces()] * 9, *[spaces(Discrete(n=5))] * 9)
-    document = parsed(_policies(many, is_team=False))
+    document, _ = proposed(examined(), many)
     assert document["policies"]["policy_0"] == [f"player_{number}" for number in range(9)], "a pattern fits others"
     assert document["sides"] is None
-    assert parsed(_policies(many, is_team=True))["sides"] == {"team": ["*"]}
+    assert proposed(examined(), many, is_team=True)[0]["sides"] == {"team": ["*"]}
 
 
 def test_a_pattern_fits_agents_with_brackets() -> None:
@@ -129,6 +137,6 @@ def test_a_pattern_fits_agents_with_brackets() -> None:
         policies=policies,
         sides={agent: (agent,) for agent in policies},
     )
-    proposed = parsed(_policies(described, is_team=False))["policies"]
-    assert proposed == {"few": ["gate"], "many": ["unit[[]a]_*"]}
-    assert divide("policies", proposed, list(policies)) == policies
+    patterns = proposed(examined(), described)[0]["policies"]
+    assert patterns == {"few": ["gate"], "many": ["unit[[]a]_*"]}
+    assert divide("policies", patterns, list(policies)) == policies
