@@ -306,7 +306,6 @@ class Case:
             "interface": examined.interface and examined.interface.digest(),
             "openings_text": str(examined.openings),
             "passed": examined.passed,
-            "views": examined.views,
         }
 
 

@@ -1,32 +1,31 @@
-"""Episodes with random legal actions, whose reports are checked."""
+"""Plays episodes with random legal actions, records them, and checks what the environment reports."""
 
 import math
 import random
 import threading
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import closing, suppress
-from dataclasses import dataclass
+from contextlib import closing
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from pettingzoo import AECEnv
 
 from league.config.league import LeagueConfig
-from league.config.network import channels_of
-from league.environments.adapters import EnvAdapter, Observation, Report, adapter_for
+from league.environments.adapters import EnvAdapter, Report, adapter_for
 from league.environments.building import build
-from league.environments.conformance.findings import Examination, PlayedEpisode, Trace
+from league.environments.conformance.findings import Examination
 from league.environments.conformance.observations import ObservationCheck, check_constant_observations
-from league.environments.conformance.openings import joined, measure_openings
-from league.environments.conformance.random_actions import RandomActions
+from league.environments.conformance.openings import measure_openings
+from league.environments.conformance.recordings import Recording, joined
 from league.environments.conformance.time_budget import TimeBudget
+from league.environments.vector.random_actions import random_actions
 from league.errors import EnvironmentMismatch, IllegalMask, LeagueError, no_exit, one_line, raised_at
 from league.interface import Interface
+from league.random.seeds import derive
 from league.spaces import ACTION_MASK
-from league.spaces.arrays import check_mask, mask_size
+from league.spaces.arrays import check_mask, environment_actions, mask_size
 
 REPETITIONS = 4
 """Further new environments, for those that draw from a common generator: tosses of a coin are often equal."""
@@ -39,118 +38,199 @@ AGREEMENT = 0.75
 """Correlation of the returns of all agents from which they may be one team: in MPE, teams have 0.75 to 1."""
 
 
-@dataclass(slots=True)
-class Place:
-    """The step that is played, to say where the environment raised an exception."""
-
-    seed: int
-    step: int = 0
-
-    def __str__(self) -> str:
-        return f"step {self.step} of the episode with seed {self.seed}" if self.step else f"reset with seed {self.seed}"
-
-
 class Examiner:
-    """Plays episodes of one environment and records what is wrong with them."""
+    """Plays episodes of one environment and adds what is wrong with them to an examination.
+
+    Attributes:
+        recording: The newest episode. It says where the environment raised an exception.
+    """
 
     def __init__(
-        self,
-        env: Any,
-        interface: Interface,
-        config: LeagueConfig,
-        found: Examination,
-        steps: int | None,
-        budget: TimeBudget,
+        self, env: Any, interface: Interface, config: LeagueConfig, examination: Examination, budget: TimeBudget
     ) -> None:
-        """steps: maximum number of steps per episode. None: episodes must end within `play.max_moves` steps."""
-        self._env, self._config, self._found, self._budget = env, config, found, budget
+        self._env, self._config, self._examination, self._budget = env, config, examination, budget
         self._agents, self._sides = list(interface.agents), interface.sides
-        self._most, self._must_end = (config.play.max_moves, True) if steps is None else (steps, False)
+        self._spaces = [spaces.action for spaces in interface.agents.values()]
         normalizes = config.training.normalize_observations
-        self._checks = [ObservationCheck(agent, env, found, normalizes) for agent in env.possible_agents]
-        self._spaces = [interface.agents[agent].action for agent in env.possible_agents]
-        self._actions = RandomActions(self._spaces)
-        self.place = Place(0)
+        self._checks = [ObservationCheck(agent, env, examination, normalizes) for agent in self._agents]
+        self._adapter = adapter_for(env, self._checks)
+        self.recording = Recording(0)
 
-    def examine(self, episodes: int, seed: int) -> None:
+    def examine(self, episodes: int, seed: int, steps: int | None) -> None:
         """Play episodes, each twice and the first one in a new environment too, and measure random openings.
 
-        Raises what the environment raises; `place` is then where.
+        Raises what the environment raises.
+
+        Args:
+            episodes: Number of episodes.
+            seed: Seed of the first one.
+            steps: Maximum number of steps per episode. None: episodes must end within `play.max_moves` steps.
         """
-        examination, adapter, budget = self._found, adapter_for(self._env, self._checks), self._budget
+        examination, budget = self._examination, self._budget
+        most = self._config.play.max_moves if steps is None else steps
         began = time.perf_counter()
-        first: list[PlayedEpisode] = []
+        first: list[Recording] = []
         while len(first) < episodes and not (first and budget.is_spent(FIRST)):
-            first.append(self._first_episode(adapter, seed + len(first), f"episode {len(first) + 1} of {episodes}"))
+            doing = f"episode {len(first) + 1} of {episodes}"
+            first.append(self.play(seed + len(first), doing, most, share=FIRST))
+            if first[-1].steps < most or first[-1].is_whole:
+                continue
+            if steps is None:
+                raise EnvironmentMismatch(
+                    f"the episode with seed {first[-1].seed} did not end within {most:,} steps (play.max_moves), after"
+                    " which a match fails: terminate or truncate it in the environment, or raise play.max_moves"
+                )
+            examination.add("note", f"an episode did not end within {most} steps (--steps)")
         examination.lengths = [episode.steps for episode in first]
         examination.steps_per_second = sum(examination.lengths) / (time.perf_counter() - began)
         is_whole = all(episode.is_whole for episode in first)
-        examination.actions_per_episode = max(episode.actions for episode in first) if is_whole else None
+        if is_whole:
+            examination.actions_per_episode = max(episode.actions for episode in first)
         if budget.is_spent(FIRST) and (len(first) < episodes or not is_whole):
             cut = "" if is_whole else f", the last one only to step {first[-1].steps}"
             budget.skipped.append(f"{len(first)} of {episodes} episodes were played{cut}")
-        self._check_seeding(adapter, first, seed)
-        self._check_thread(first[0], seed)
-        traces = [episode.trace for episode in first]
-        check_constant_observations(traces, self._env, examination)
+        self._check_seeding(first)
+        self._check_thread(first[0])
+        check_constant_observations(first, self._env, examination)
         if is_whole:
-            _check_endings(traces, examination)
-        self._check_returns(adapter, first, seed + episodes)
-        examination.openings = measure_openings(adapter, self._spaces, seed, budget, OPENINGS)
+            _check_endings(first, examination)
+        self._check_returns(first, seed + episodes)
+        examination.openings = measure_openings(self.play, seed, budget, OPENINGS)
         if examination.openings is None:
             budget.skipped.append("random openings were not measured")
         _check_openings(self._config.play.opening_plies, examination)
 
-    def _first_episode(self, adapter: EnvAdapter, seed: int, doing: str) -> PlayedEpisode:
-        episode = self._episode(adapter, seed, doing, self._most, share=FIRST)
-        if episode.steps < self._most or episode.is_whole:
-            return episode
-        if self._must_end:
-            raise EnvironmentMismatch(
-                f"the episode with seed {seed} did not end within {self._most:,} steps (play.max_moves), after which a"
-                " match fails: terminate or truncate it in the environment, or raise play.max_moves"
-            )
-        self._found.add("note", f"an episode did not end within {self._most} steps (--steps)")
-        return episode
+    def play(
+        self,
+        seed: int,
+        doing: str,
+        most: int,
+        *,
+        adapter: EnvAdapter | None = None,
+        share: float | None = None,
+        states: bool = False,
+        actions_seed: int | None = None,
+    ) -> Recording:
+        """Play an episode with random legal actions, and check its reports.
 
-    def _check_seeding(self, adapter: EnvAdapter, first: list[PlayedEpisode], seed: int) -> None:
+        Args:
+            seed: Seed of the episode.
+            doing: What the progress says.
+            most: Steps after which the episode is cut.
+            adapter: A new environment; by default the one that is examined.
+            share: Share of the time after which it is cut.
+            states: Check the global state at each step.
+            actions_seed: Seed of the actions; that of the episode by default.
+        """
+        adapter = adapter or self._adapter
+        recording = self.recording = Recording(seed)
+        reports = adapter.reset(seed)
+        actions_seed = seed if actions_seed is None else actions_seed
+        generators = [np.random.default_rng(derive(actions_seed, agent)) for agent in range(len(self._agents))]
+        while True:
+            recording.turns.append(reports)
+            if states:
+                self._check_state(adapter)
+            moves = []
+            for report in reports:
+                self._check_report(report, adapter)
+                agent, observation, _, terminated, truncated = report
+                if not (terminated or truncated):
+                    mask, space = observation.get(ACTION_MASK), self._spaces[agent]
+                    rows = None if mask is None else mask[np.newaxis]
+                    action = random_actions(space, 1, rows, generators[agent])
+                    moves.append((agent, environment_actions(action, space)[0]))
+            recording.is_whole = not moves
+            is_late = share is not None and recording.steps > 0 and self._budget.is_spent(share)
+            if not moves or recording.steps == most or is_late:
+                return recording
+            self._budget.report(f"{doing}, step {recording.steps + 1}")
+            reports = adapter.step(moves)
+
+    def _check_report(self, report: Report, adapter: EnvAdapter) -> None:
+        agent, observation, reward, terminated, truncated = report
+        name, add = self._agents[agent], self._examination.add
+        if not math.isfinite(reward):
+            add("fault", f"got a reward of {reward}, expected a finite number", name)
+        if terminated and truncated:
+            add("note", "was both terminated and truncated: treated as terminated", name)
+        for part, array in observation.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                add("fault", f"observes NaN or infinity in {part}", name)
+        if terminated or truncated:
+            return
+        if ACTION_MASK in observation:
+            try:
+                check_mask(observation[ACTION_MASK][np.newaxis])
+            except IllegalMask as error:
+                add("fault", str(error), name)
+        elif mask_size(self._spaces[agent]) is not None and (
+            isinstance(info := adapter.infos.get(name), Mapping) and ACTION_MASK in info
+        ):
+            # It is not used, because no info had one after the first reset.
+            text = "gets a mask in its info after a step, but no agent gets one after reset: report masks from reset on"
+            add("fault", text, name)
+
+    def _check_state(self, adapter: EnvAdapter) -> None:
+        """Centralised learners need a global state of a fixed size."""
+        examination = self._examination
+        try:
+            with no_exit:
+                raw_state = adapter.state()
+            state = None if raw_state is None else np.asarray(raw_state, dtype=np.float32)
+        except Exception as error:
+            reason = one_line(error, with_type=True)
+            text = f"its global state, which only centralised learners need, cannot be read: {reason}"
+            examination.add("note", text)
+            return
+        if state is None:
+            return
+        if examination.state_size not in (None, state.size):
+            example = f"{state.size} numbers, after {examination.state_size}"
+            examination.add("fault", "its global state has no fixed size", example=example)
+        if not np.isfinite(state).all():
+            examination.add("fault", "its global state has NaN or infinity")
+        examination.state_size = state.size
+
+    def _check_seeding(self, first: Sequence[Recording]) -> None:
         """Play the same episodes again, in reverse order, and the first one in new environments."""
         # After the timing, because a global state may be a large image.
         again = [
-            self._episode(adapter, seed + i, "the same episodes again", first[i].steps, states=True)
-            for i in reversed(range(len(first)))
-        ][::-1]
+            self.play(episode.seed, "the same episodes again", episode.steps, states=True) for episode in first[::-1]
+        ]
         before = _global_generators()
-        anew = self._anew(first[0], seed)
+        anew = [self._anew(first[0])]
         drawn = [name for name, state in _global_generators().items() if state != before[name]]
-        more: list[PlayedEpisode] = []
-        while drawn and len(more) < REPETITIONS and not self._budget.is_spent(FIRST):
-            more.append(self._anew(first[0], seed))
-        pairs = [*zip(first, again, strict=True), *((first[0], episode) for episode in (anew, *more))]
+        while drawn and len(anew) <= REPETITIONS and not self._budget.is_spent(FIRST):
+            anew.append(self._anew(first[0]))
+        pairs = [*zip(first, again[::-1], strict=True), *((first[0], episode) for episode in anew)]
         change = next((change for one, other in pairs if (change := self._change(one, other))), None)
         if change is None:
             return
-        if not any(self._change(episode, anew) for episode in more or [self._anew(first[0], seed)]):
-            text = "the same seed gives another episode after other episodes: reset must clear all state"
-        else:
+        if len(anew) == 1:
+            anew.append(self._anew(first[0]))
+        if any(self._change(anew[0], episode) for episode in anew[1:]):
             text = (
                 "the same seed gives another episode in each new environment: all randomness must follow the seed of"
                 " reset"
             ) + "".join(f", and it draws from the generator of the module {name}" for name in drawn)
-        self._found.add("fault", text, example=change)
+        else:
+            text = "the same seed gives another episode after other episodes: reset must clear all state"
+        self._examination.add("fault", text, example=change)
 
-    def _anew(self, episode: PlayedEpisode, seed: int, share: float | None = None) -> PlayedEpisode:
-        """Play an episode in a new environment. share: see `_episode`."""
+    def _anew(self, episode: Recording, share: float | None = None) -> Recording:
+        """Play an episode in a new environment. share: see `play`."""
         with closing(adapter_for(build(self._config.environment), self._checks)) as fresh:
-            return self._episode(fresh, seed, "the first episode in a new environment", episode.steps, share)
+            doing = "the first episode in a new environment"
+            return self.play(episode.seed, doing, episode.steps, adapter=fresh, share=share)
 
-    def _check_thread(self, episode: PlayedEpisode, seed: int) -> None:
+    def _check_thread(self, episode: Recording) -> None:
         """Play an episode, which a new environment has played here, outside of the main thread, as training does."""
-        outcome: Future[PlayedEpisode] = Future()
+        outcome: Future[Recording] = Future()
 
         def play() -> None:
             try:
-                outcome.set_result(self._anew(episode, seed, FIRST))
+                outcome.set_result(self._anew(episode, FIRST))
             except BaseException as error:
                 outcome.set_exception(error)
 
@@ -160,113 +240,48 @@ class Examiner:
                 outcome.result()
         except Exception as error:
             where = "".join(f"{line}, " for line in [raised_at(error)] if line)
-            self._found.add(
+            self._examination.add(
                 "fault",
                 "outside of the main thread, where training plays too, the environment raised an exception"
-                f" ({where}{self.place}): {one_line(error, with_type=not isinstance(error, LeagueError))}. Signals, for"
-                " example, work only in the main thread: limit times by timeouts of sockets, subprocesses or threads",
+                f" ({where}{self.recording.place}): {one_line(error, with_type=not isinstance(error, LeagueError))}."
+                " Signals, for example, work only in the main thread: limit times by timeouts of sockets, subprocesses"
+                " or threads",
             )
 
-    def _change(self, one: PlayedEpisode, other: PlayedEpisode) -> str:
+    def _change(self, one: Recording, other: Recording) -> str:
         """Describe the first report that differs between two episodes; empty if they are equal."""
         names = ("agent", "observation", "reward", "termination", "truncation")
-        for number, (before, after) in enumerate(zip(one.trace, other.trace, strict=False), start=1):
+        for number, reports in enumerate(zip(one.reports, other.reports, strict=False), start=1):
+            # NaN is equal to itself, and 0 to -0.
+            before, after = (
+                (agent, joined(observation), str(reward + 0.0), *flags)
+                for agent, observation, reward, *flags in reports
+            )
             for name, value, changed in zip(names, before, after, strict=True):
                 if value != changed:
-                    return f"the {name} in report {number}, of {self._agents[before[0]]}"
-        return "the length of an episode" if len(one.trace) != len(other.trace) else ""
+                    return f"the {name} in report {number}, of {self._agents[reports[0][0]]}"
+        return "the length of an episode" if len(one.reports) != len(other.reports) else ""
 
-    def _episode(
-        self, adapter: EnvAdapter, seed: int, doing: str, most: int, share: float | None = None, states: bool = False
-    ) -> PlayedEpisode:
-        """Play an episode with random legal actions.
-
-        Args:
-            adapter: The environment.
-            seed: Seed of the episode.
-            doing: What the progress says.
-            most: Steps after which the episode is cut.
-            share: Share of the time after which it is cut.
-            states: Check the global state at each step, and compare the observations of agents.
-        """
-        trace: Trace = []
-        returns, actions, step = [0.0] * len(self._agents), [0] * len(self._agents), 0
-        self.place = Place(seed)
-        reports = adapter.reset(seed)
-        self._actions.seed(seed)
-        while True:
-            if states:
-                _check_state(adapter, self._found)
-                self._compare_views(reports)
-            moves = []
-            for agent, observation, reward, terminated, truncated in reports:
-                trace.append((agent, joined(observation), reward, terminated, truncated))
-                returns[agent] += reward
-                _check_report(self._agents[agent], (agent, observation, reward, terminated, truncated), self._found)
-                if not (terminated or truncated):
-                    info = adapter.infos.get(self._agents[agent])
-                    is_unmasked = ACTION_MASK not in observation and mask_size(self._spaces[agent]) is not None
-                    if is_unmasked and isinstance(info, Mapping) and ACTION_MASK in info:
-                        # It is not used, because no info had one after the first reset.
-                        text = "gets a mask in its info after a step, but no agent gets one after reset: report masks"
-                        self._found.add("fault", f"{text} from reset on", self._agents[agent])
-                    moves.append((agent, self._actions.draw(agent, observation.get(ACTION_MASK))))
-            is_late = share is not None and step > 0 and self._budget.is_spent(share)
-            if not moves or step == most or is_late:
-                return PlayedEpisode(trace, step, max(actions), tuple(returns), is_whole=not moves)
-            for agent, _ in moves:
-                actions[agent] += 1
-            step += 1
-            self.place.step = step
-            self._budget.report(f"{doing}, step {step}")
-            reports = adapter.step(moves)
-
-    def _compare_views(self, reports: Sequence[Report]) -> None:
-        """Find out whether two agents observe different things in one state."""
-        if self._found.views_differ:
-            return
-        if isinstance(self._env, AECEnv):
-            with suppress(Exception):  # `observe` of an agent that is not to act is optional
-                views = [
-                    check.arrays(self._env.observe(agent))
-                    for agent, check in zip(self._agents, self._checks, strict=True)
-                    if agent in self._env.agents
-                ]
-                self._found.views_differ = _differ(views)
-        else:
-            self._found.views_differ = _differ([observation for _, observation, *_ in reports])
-
-    def _check_returns(self, adapter: EnvAdapter, first: list[PlayedEpisode], seed: int) -> None:
+    def _check_returns(self, first: Sequence[Recording], seed: int) -> None:
         """Find agents whose returns agree, as those of a team do."""
-        games = [episode.returns for episode in first if episode.is_whole]
-        if not games or len(self._agents) == 1:
+        whole = [episode for episode in first if episode.is_whole]
+        if not whole or len(self._agents) == 1:
             return
+        games = [episode.returns(len(self._agents)) for episode in whole]
         if _agreement(games) != 1.0:
             # Returns of episodes of very different lengths would agree by their lengths.
-            games = [episode.returns for episode in first if episode.is_whole and episode.steps <= LONGEST_GAME]
+            games = [game for game, episode in zip(games, whole, strict=True) if episode.steps <= LONGEST_GAME]
         while len(games) < GAMES and _agreement(games) != 1.0 and not self._budget.is_spent(RETURNS):
             doing = f"returns of game {len(games) + 1} of {GAMES}"
-            games.append(self._episode(adapter, seed + len(games), doing, LONGEST_GAME, share=RETURNS).returns)
-        agreement = self._found.agreement = _agreement(games)
+            game = self.play(seed + len(games), doing, LONGEST_GAME, share=RETURNS)
+            games.append(game.returns(len(self._agents)))
+        agreement = self._examination.agreement = _agreement(games)
         if agreement is not None and agreement >= AGREEMENT and len(self._sides) > 1 and self._config.sides is None:
             how = "are equal" if agreement == 1.0 else f"agree (correlation {agreement:.2f} in {len(games)} games)"
-            self._found.add(
+            self._examination.add(
                 "note",
                 f'the returns of all agents {how}: are they one team? A team is one side: `sides: {{team: ["*"]}}`',
             )
-
-
-def _differ(views: Sequence[Observation]) -> bool:
-    """Whether two observations differ. Boards show the same in another order: my pieces, then yours."""
-    return len({b"".join(_planes(array) for name, array in view.items() if name != ACTION_MASK) for view in views}) > 1
-
-
-def _planes(array: NDArray[Any]) -> bytes:
-    """The values of an array; of a board or an image, its planes in the order of their values."""
-    if array.ndim != 3:
-        return array.tobytes()
-    planes = np.moveaxis(array, 0 if channels_of(array.shape) == "first" else -1, 0)
-    return b"".join(sorted(plane.tobytes() for plane in planes))
 
 
 def _agreement(games: Sequence[Sequence[float]]) -> float | None:
@@ -290,73 +305,39 @@ def _global_generators() -> dict[str, object]:
     return {"random": random.getstate(), "numpy.random": (legacy[1].tobytes(), legacy[2])}
 
 
-def _check_endings(traces: list[Trace], found: Examination) -> None:
+def _check_endings(episodes: Sequence[Recording], examination: Examination) -> None:
     """Find games without rewards and without endings, which are known faults of Shimmy's OpenSpiel environments.
 
     A limit of steps truncates all episodes at the same length, and rewards can be rare: this is no fault.
     """
-    has_rewards = any(reward for trace in traces for _, _, reward, *_ in trace)
-    ends = [(terminated, truncated) for trace in traces for *_, terminated, truncated in trace]
-    all_truncated = any(truncated for _, truncated in ends) and not any(terminated for terminated, _ in ends)
-    if all_truncated and not has_rewards and len({len(trace) for trace in traces}) > 1:
-        found.add(
+    ends = Counter[str]()
+    for *_, reward, terminated, truncated in (report for episode in episodes for report in episode.reports):
+        ends.update(rewards=reward != 0, terminated=terminated, truncated=truncated)
+    all_truncated = ends["truncated"] and not ends["terminated"]
+    if all_truncated and not ends["rewards"] and len({len(episode.reports) for episode in episodes}) > 1:
+        examination.add(
             "fault",
             "all episodes were truncated and all rewards were 0: the environment does not report how its games end"
             " (games of OpenSpiel: use `entry_point: openspiel` instead of Shimmy)",
         )
-    elif not has_rewards:
-        found.add("note", f"all rewards were 0 in {len(traces)} episodes: a policy cannot learn from them")
+    elif not ends["rewards"]:
+        examination.add("note", f"all rewards were 0 in {len(episodes)} episodes: a policy cannot learn from them")
     elif all_truncated:
-        found.add("note", "all episodes were truncated, none was terminated: their last values are bootstrapped")
+        examination.add("note", "all episodes were truncated, none was terminated: their last values are bootstrapped")
 
 
-def _check_openings(plies: int, found: Examination) -> None:
+def _check_openings(plies: int, examination: Examination) -> None:
     """Compare `play.opening_plies` with what is recommended."""
-    openings = found.openings
+    openings = examination.openings
     if openings is None:
         return
     if openings.recommended and not plies:
         best = openings.recommended
-        found.add("note", f"greedy policies would repeat one game: set play.opening_plies, for example to {best}")
+        examination.add("note", f"greedy policies would repeat one game: set play.opening_plies, for example to {best}")
     if not 0 < plies <= len(openings.lengths):
         return
     if warning := openings.warning(plies):
-        found.add("note", f"play.opening_plies: {plies} is long for this game. {openings.effect(plies)}. {warning}")
+        text = f"play.opening_plies: {plies} is long for this game. {openings.effect(plies)}. {warning}"
+        examination.add("note", text)
     if openings.lengths[plies - 1].positions <= 1:
-        found.add("note", f"play.opening_plies: {plies} does nothing. {openings.effect(plies)}")
-
-
-def _check_report(agent: str, report: Report, found: Examination) -> None:
-    _, observation, reward, terminated, truncated = report
-    if not math.isfinite(reward):
-        found.add("fault", f"got a reward of {reward}, expected a finite number", agent)
-    if terminated and truncated:
-        found.add("note", "was both terminated and truncated: treated as terminated", agent)
-    if ACTION_MASK in observation and not (terminated or truncated):
-        try:
-            check_mask(observation[ACTION_MASK][np.newaxis])
-        except IllegalMask as error:
-            found.add("fault", str(error), agent)
-    for name, array in observation.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            found.add("fault", f"observes NaN or infinity in {name}", agent)
-
-
-def _check_state(adapter: EnvAdapter, found: Examination) -> None:
-    """Centralised learners need a global state of a fixed size."""
-    try:
-        with no_exit:
-            raw_state = adapter.state()
-        state = None if raw_state is None else np.asarray(raw_state, dtype=np.float32)
-    except Exception as error:
-        reason = one_line(error, with_type=True)
-        found.add("note", f"its global state, which only centralised learners need, cannot be read: {reason}")
-        return
-    if state is None:
-        return
-    if found.state_size not in (None, state.size):
-        expected = f"{found.state_size}: expected a fixed size"
-        found.add("fault", f"its global state has {state.size} numbers, after {expected}")
-    if not np.isfinite(state).all():
-        found.add("fault", "its global state has NaN or infinity")
-    found.state_size = state.size
+        examination.add("note", f"play.opening_plies: {plies} does nothing. {openings.effect(plies)}")

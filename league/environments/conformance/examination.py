@@ -73,7 +73,12 @@ def examine(
     try:
         interface = _described(env, config, examination)
         if interface is not None and config.environment.external is None:
-            _play(env, interface, config, examination, budget, episodes, steps, seed)
+            examiner = Examiner(env, interface, config, examination, budget)
+            try:
+                with no_exit:
+                    examiner.examine(episodes, seed, steps)
+            except Exception as error:
+                examination.add("fault", _explained(error, config, seed, examiner.recording.place))
     finally:
         error_of_close = env.close()
     if error_of_close is not None:
@@ -130,45 +135,26 @@ def _described(env: Any, config: LeagueConfig, examination: Examination) -> Inte
     return interface if examination.passed else None
 
 
-def _play(
-    env: Any,
-    interface: Interface,
-    config: LeagueConfig,
-    examination: Examination,
-    budget: TimeBudget,
-    episodes: int,
-    steps: int | None,
-    seed: int,
-) -> None:
-    """Play and check episodes. See `examine`."""
-    examiner = Examiner(env, interface, config, examination, steps, budget)
-    try:
-        with no_exit:
-            examiner.examine(episodes, seed)
-    except InvalidReturn as error:
-        examination.add("fault", f"{error} ({examiner.place})")
-    except LeagueError as error:
-        examination.add("fault", str(error))
-    except Exception as error:
-        examination.add("fault", _explained(error, config, seed, str(examiner.place)))
-
-
 def _explained(error: Exception, config: LeagueConfig, seed: int, place: str) -> str:
     """The fault that an exception shows. A wrapper's own exception does not say what it was given."""
+    if isinstance(error, InvalidReturn):
+        return f"{error} ({place})"
+    if isinstance(error, LeagueError):
+        return str(error)
     if config.environment.wrappers:
         bare = config.model_copy(update={"environment": config.environment.model_copy(update={"wrappers": ()})})
         with contextlib.suppress(Exception):
             try:
                 with no_exit, contextlib.closing(build(bare.environment)) as env:
-                    interface = describe(env, bare)
-                    Examiner(env, interface, bare, Examination(), None, TimeBudget(BARE_SECONDS)).examine(1, seed)
+                    budget = TimeBudget(BARE_SECONDS)
+                    Examiner(env, describe(env, bare), bare, Examination(), budget).examine(1, seed, None)
             except InvalidReturn as returned:
                 return f"{returned} (below its wrappers, {place})"
     where = "".join(f"{line}, " for line in [raised_at(error)] if line)
     return f"the environment raised an exception ({where}{place}): {one_line(error, with_type=True)}"
 
 
-def _compare_vectorised(config: EnvironmentConfig, interface: Interface, found: Examination, seed: int) -> None:
+def _compare_vectorised(config: EnvironmentConfig, interface: Interface, examination: Examination, seed: int) -> None:
     """Compare the vectorised environment, if there is one, with the stock one."""
     vector = implementation(config).vector
     if vector is None:
@@ -177,22 +163,22 @@ def _compare_vectorised(config: EnvironmentConfig, interface: Interface, found: 
         with no_exit:
             comparison = compare(config, vector(COMPARED_COPIES, **config.kwargs), COMPARED_STEPS, seed)
             if comparison.difference is not None:
-                found.add("fault", f"the vectorised environment differs: {comparison.difference}")
+                examination.add("fault", f"the vectorised environment differs: {comparison.difference}")
                 return
             actions = [spaces.action for spaces in interface.agents.values()]
             rate = steps_per_second(vector(MEASURED_COPIES, **config.kwargs), actions, seed, MEASURED_SECONDS)
     except Exception as error:
-        found.add("fault", f"the vectorised environment raised an exception: {one_line(error, with_type=True)}")
+        examination.add("fault", f"the vectorised environment raised an exception: {one_line(error, with_type=True)}")
         return
-    found.vectorised = Vectorised(comparison.steps, MEASURED_COPIES, rate, comparison.stock_rate)
+    examination.vectorised = Vectorised(comparison.steps, MEASURED_COPIES, rate, comparison.stock_rate)
 
 
-def _run_pettingzoo_tests(config: EnvironmentConfig, found: Examination, budget: TimeBudget) -> None:
+def _run_pettingzoo_tests(config: EnvironmentConfig, examination: Examination, budget: TimeBudget) -> None:
     """Run PettingZoo's API tests. They check more than is required here, so failures are notes."""
-    steps = CYCLES * (found.agents if found.api == "AEC" else 1)
-    if found.api == "MultiAgentEnv" or not found.steps_per_second:
+    steps = CYCLES * (examination.agents if examination.api == "AEC" else 1)
+    if examination.api == "MultiAgentEnv" or not examination.steps_per_second:
         return
-    if not budget.allows(steps / found.steps_per_second):
+    if budget.is_spent(ahead=steps / examination.steps_per_second):
         budget.skipped.append("PettingZoo's API test was not run")
         return
     budget.report("PettingZoo's API test")
@@ -205,4 +191,4 @@ def _run_pettingzoo_tests(config: EnvironmentConfig, found: Examination, budget:
                 else:
                     parallel_api_test(env, num_cycles=CYCLES)
         except Exception as error:
-            found.add("note", f"PettingZoo's API test fails: {one_line(error, with_type=True)}")
+            examination.add("note", f"PettingZoo's API test fails: {one_line(error, with_type=True)}")

@@ -12,29 +12,6 @@ CERTAIN_AGREEMENT = 0.95
 Severity = Literal["fault", "note"]
 
 
-Trace = list[tuple[int, bytes, float, bool, bool]]
-"""All reports of an episode, in order."""
-
-
-@dataclass(frozen=True, slots=True)
-class PlayedEpisode:
-    """A played episode.
-
-    Attributes:
-        trace: All reports.
-        steps: Environment steps, in which several agents may act.
-        actions: Number of actions of the agent with the most.
-        returns: Return of each agent.
-        is_whole: Whether it ended, and was not cut.
-    """
-
-    trace: Trace
-    steps: int
-    actions: int
-    returns: tuple[float, ...]
-    is_whole: bool
-
-
 @dataclass(frozen=True, slots=True)
 class Finding:
     """A problem, with the expected behaviour, the affected agents, and an example of the first one."""
@@ -83,8 +60,6 @@ class Examination:
     steps_per_second: float = 0.0
     agreement: float | None = None
     """Smallest correlation of the returns of two agents, 1 if all are equal; None if it was not measured."""
-    views_differ: bool = False
-    """Whether agents observe different things in the same state."""
     state_size: int | None = None
     """Size of the global state; None without one."""
     implementation: str = ""
@@ -99,17 +74,6 @@ class Examination:
     """What random openings are worth; None if it was not measured."""
     vectorised: Vectorised | None = None
     """Comparison with the vectorised environment, if there is one."""
-
-    @property
-    def views(self) -> str:
-        """How to declare what opponents do not see, where agents observe different things; else empty."""
-        if not self.views_differ or self.interface is None or len(self.interface.sides) == 1:
-            return ""
-        declare = "" if self.interface.hidden_information else ' `metadata["hidden_information"] = True` and'
-        return (
-            "Agents observe different things. If opponents must not see what an agent observes, the environment"
-            f" declares{declare} `render_for(agent)`, the picture that this agent may see."
-        )
 
     @property
     def is_team(self) -> bool:

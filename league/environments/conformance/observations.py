@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from league.environments.adapters import Observation
 from league.environments.building import agent_interface, observation_space
-from league.environments.conformance.findings import Examination, Trace
+from league.environments.conformance.findings import Examination
+from league.environments.conformance.recordings import Recording, joined
 from league.errors import EnvironmentMismatch, InvalidReturn
 from league.spaces import ACTION_MASK, Box, Leaf, inputs
 from league.spaces.arrays import bounds, tensors
@@ -27,9 +28,9 @@ LARGEST = 1e9
 class ObservationCheck:
     """Splits an agent's observations into arrays, and checks them against its space."""
 
-    def __init__(self, agent: str, env: Any, found: Examination, normalizes: bool) -> None:
+    def __init__(self, agent: str, env: Any, examination: Examination, normalizes: bool) -> None:
         """normalizes: whether training scales floats by their running statistics."""
-        self._agent, self._found = agent, found
+        self._agent, self._examination = agent, examination
         self._gymnasium = observation_space(env, agent)
         self._space = agent_interface(env, agent).observation
         self._leaves = inputs(self._space)
@@ -44,7 +45,7 @@ class ObservationCheck:
         for array, copy in self._kept:
             if not np.array_equal(array, copy, equal_nan=True):
                 text = "its observations are modified after they are returned: they are copied"
-                self._found.add("note", text, self._agent)
+                self._examination.add("note", text, self._agent)
         arrays = self.arrays(value)
         misshapen = [name for name, leaf in self._leaves.items() if arrays[name].shape != leaf.shape]
         for name in misshapen:
@@ -52,15 +53,15 @@ class ObservationCheck:
             text = f"observes {name} with shape {shape}, but its space has {expected}: {REMEDY}"
             if name == ACTION_MASK:
                 raise InvalidReturn(f"agent {self._agent} {text}")  # no legal action can be drawn
-            self._found.add("fault", text, self._agent)
+            self._examination.add("fault", text, self._agent)
         for name, leaf in self._raw.items() if not misshapen else ():
             largest = np.abs(arrays[name].astype(np.float64)).max()
             if LARGEST < largest < np.inf:
                 text = f"observes too large values in {name}: training needs at most {LARGEST:g}: scale them"
                 remedy = ", or set training.normalize_observations" * (np.dtype(leaf.dtype).kind == "f")
-                self._found.add("fault", text + remedy, self._agent, example=f"{largest:.3g}")
+                self._examination.add("fault", text + remedy, self._agent, example=f"{largest:.3g}")
         if not misshapen and not self._gymnasium.contains(value):
-            self._found.add(
+            self._examination.add(
                 "note",
                 f"observations are not in its space {_shortened(self._gymnasium)}: the bounds or the dtype differ;"
                 " values are cast to the dtype of the space",
@@ -100,13 +101,16 @@ def _example_outside(leaves: Mapping[str, Leaf], arrays: Observation) -> str:
     return ""
 
 
-def check_constant_observations(traces: Sequence[Trace], env: Any, found: Examination) -> None:
+def check_constant_observations(episodes: Sequence[Recording], env: Any, examination: Examination) -> None:
     """Find agents whose observation never changes in the second half of an episode, when frame stacks are full.
 
     A constant image is a fault; a constant vector is a note, because a game may have a single state.
     """
     for index, agent in enumerate(env.possible_agents):
-        histories = [[observation for reporting, observation, *_ in trace if reporting == index] for trace in traces]
+        histories = [
+            [joined(observation) for reporting, observation, *_ in episode.reports if reporting == index]
+            for episode in episodes
+        ]
         turns = max(map(len, histories))
         if turns < ENOUGH_TURNS or any(len(set(history[len(history) // 2 :])) > 1 for history in histories):
             continue
@@ -116,6 +120,6 @@ def check_constant_observations(traces: Sequence[Trace], env: Any, found: Examin
                 f"observes a constant image for {turns} turns; some environments draw only with"
                 " `kwargs: {render_mode: rgb_array}`"
             )
-            found.add("fault", text, agent)
+            examination.add("fault", text, agent)
         else:
-            found.add("note", f"observes a constant value in an episode of {turns} turns", agent)
+            examination.add("note", f"observes a constant value in an episode of {turns} turns", agent)

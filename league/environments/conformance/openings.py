@@ -1,20 +1,13 @@
 """What random openings do to the games of an environment, and how many plies are worth having."""
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil
 from statistics import median
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from league.environments.adapters import EnvAdapter, Observation, Report
-from league.environments.conformance.random_actions import RandomActions
+from league.environments.adapters import Report
+from league.environments.conformance.recordings import Recording, joined
 from league.environments.conformance.time_budget import TimeBudget
-from league.spaces import ACTION_MASK, Box, Discrete, MultiDiscrete, Space
-from league.spaces.arrays import bounds, environment_actions
 
 SEEDS = 20
 """Games of deterministic play that are compared."""
@@ -100,17 +93,13 @@ def counted_plies(plies: int) -> str:
     return "1 ply" if plies == 1 else f"{plies} plies"
 
 
-class _OutOfTimeError(Exception): ...
-
-
 def measure_openings(
-    adapter: EnvAdapter, spaces: Sequence[Space], seed: int, budget: TimeBudget, share: float
+    play: Callable[..., Recording], seed: int, budget: TimeBudget, share: float
 ) -> OpeningMeasurement | None:
     """Play deterministic games with different seeds and, if they repeat each other, random openings.
 
     Args:
-        adapter: The environment.
-        spaces: Action space of each agent.
+        play: `Examiner.play`.
         seed: Seed of the first game.
         budget: The time for all checks.
         share: Share of the time after which the measurement is given up, except for the number of random openings.
@@ -119,19 +108,26 @@ def measure_openings(
         The measurement, None without enough time. 0 plies are recommended if at least half of the deterministic games
         differ, or if no opening leads to a second position.
     """
-    games = _Games(adapter, spaces, budget, share)
-    try:
-        different = len({games.first_position(seed + i) for i in range(SEEDS)})
-        if 2 * different < SEEDS:
-            different = len({games.deterministic(seed + i) for i in range(SEEDS)})
-        if 2 * different >= SEEDS:
+
+    def games(count: int, most: int, actions_seed: int | None = None) -> Iterator[Recording]:
+        for number in range(count):
+            doing = f"random openings, game {number + 1} of {count}"
+            recording = play(seed + number, doing, most, share=share, actions_seed=actions_seed)
+            if budget.is_spent(share):
+                return
+            yield recording
+
+    for most in (0, LONGEST_GAME):
+        histories = [tuple(map(_position, game.turns)) for game in games(SEEDS, most, actions_seed=0)]
+        if len(histories) < SEEDS:
+            return None
+        if 2 * (different := len(set(histories))) >= SEEDS:
             return OpeningMeasurement(different, SEEDS, (), 0)
-        whole = [len(games.random(seed + i, LONGEST_GAME)) for i in range(SEEDS)]
-        openings = [games.random(seed + i, LONGEST) for i in range(FEWEST_OPENINGS)]
-        with suppress(_OutOfTimeError):
-            while len(openings) < OPENINGS:
-                openings.append(games.random(seed + len(openings), LONGEST))
-    except _OutOfTimeError:
+    steps = [game.steps for game in games(SEEDS, LONGEST_GAME)]
+    openings = [
+        list(map(_position, game.turns[: game.steps + (not game.is_whole)])) for game in games(OPENINGS, LONGEST)
+    ]
+    if len(steps) < SEEDS or len(openings) < FEWEST_OPENINGS:
         return None
     lengths = []
     for plies in range(1, LONGEST + 1):
@@ -139,7 +135,7 @@ def measure_openings(
         reached = [positions[plies] for positions in openings if len(positions) > plies]
         ended = 1 - len(reached) / len(openings)
         lengths.append(OpeningLength(len(set(reached)) / len(openings), ended, len(openings)))
-    return OpeningMeasurement(different, SEEDS, tuple(lengths), recommended(lengths, median(whole)))
+    return OpeningMeasurement(different, SEEDS, tuple(lengths), recommended(lengths, median(steps)))
 
 
 def recommended(lengths: Sequence[OpeningLength], game: float) -> int:
@@ -155,73 +151,5 @@ def recommended(lengths: Sequence[OpeningLength], game: float) -> int:
     return best if lengths[best - 1].positions > 1 else 0
 
 
-class _Games:
-    """Plays games as long as the time allows."""
-
-    def __init__(self, adapter: EnvAdapter, spaces: Sequence[Space], budget: TimeBudget, share: float) -> None:
-        self._adapter, self._spaces, self._budget, self._share = adapter, spaces, budget, share
-        self._actions = RandomActions(spaces)
-        self._played = 0
-
-    def first_position(self, seed: int) -> bytes:
-        """Return the observations after a reset."""
-        return _position(self._reset(seed))
-
-    def deterministic(self, seed: int) -> bytes:
-        """Return all observations of a game in which each agent takes its first legal action."""
-        positions, last = self._game(seed, LONGEST_GAME, lambda agent, mask: _first(self._spaces[agent], mask))
-        return b"".join([*positions, last])
-
-    def random(self, seed: int, steps: int) -> list[bytes]:
-        """Return the positions of a game with random legal actions in which an agent must act."""
-        self._actions.seed(seed)
-        return self._game(seed, steps + 1, self._actions.draw)[0]
-
-    def _reset(self, seed: int) -> list[Report]:
-        if self._budget.is_spent(self._share):
-            raise _OutOfTimeError
-        self._played += 1
-        self._budget.report(f"random openings, game {self._played}")
-        return self._adapter.reset(seed)
-
-    def _game(
-        self, seed: int, steps: int, choose: Callable[[int, NDArray[Any] | None], Any]
-    ) -> tuple[list[bytes], bytes]:
-        """Return the positions in which an agent must act, and the last one, empty if the game is not over."""
-        positions: list[bytes] = []
-        reports = self._reset(seed)
-        for _ in range(steps):
-            moves = [
-                (agent, choose(agent, observation.get(ACTION_MASK)))
-                for agent, observation, _, terminated, truncated in reports
-                if not (terminated or truncated)
-            ]
-            if not moves:
-                return positions, _position(reports)
-            positions.append(_position(reports))
-            if self._budget.is_spent(self._share):
-                raise _OutOfTimeError
-            reports = self._adapter.step(moves)
-        return positions, b""
-
-
-def _position(reports: Sequence[Report]) -> bytes:
-    return b"".join(bytes([agent % 256]) + joined(observation) for agent, observation, *_ in reports)
-
-
-def joined(observation: Observation) -> bytes:
-    """Return the values of an observation as bytes."""
-    return b"".join(np.ascontiguousarray(array).tobytes() for array in observation.values())
-
-
-def _first(space: Space, mask: NDArray[Any] | None) -> Any:
-    """Return the first legal action, or the value of a Box that is nearest to 0."""
-    if isinstance(space, Box):
-        action = np.clip(np.zeros(space.shape), *bounds(space))
-    else:
-        assert isinstance(space, Discrete | MultiDiscrete), "other actions are a fault, and no game is played"
-        choices = np.ravel(space.nvec if isinstance(space, MultiDiscrete) else space.n)
-        allowed = np.ones(choices.sum()) if mask is None else mask != 0
-        raw = np.array([part.argmax() for part in np.split(allowed, np.cumsum(choices)[:-1])])
-        action = np.asarray(space.start) + raw.reshape(space.shape)
-    return environment_actions(action[np.newaxis].astype(space.dtype), space)[0]
+def _position(reports: Sequence[Report]) -> int:
+    return hash(tuple((agent, joined(observation)) for agent, observation, *_ in reports))

@@ -18,13 +18,9 @@ class TimeBudget:
         self.skipped: list[str] = []
         """What was left out, or done in part, because the time was spent."""
 
-    def is_spent(self, share: float = 1.0) -> bool:
-        """Return whether this share of the time is over."""
-        return self.seconds is not None and time.monotonic() - self._began >= share * self.seconds
-
-    def allows(self, seconds: float) -> bool:
-        """Return whether something that takes this long may begin."""
-        return self.seconds is None or time.monotonic() - self._began + seconds <= self.seconds
+    def is_spent(self, share: float = 1.0, ahead: float = 0.0) -> bool:
+        """Return whether this share of the time is over, or will be in `ahead` seconds."""
+        return self.seconds is not None and time.monotonic() - self._began + ahead >= share * self.seconds
 
     def report(self, doing: str) -> None:
         """Report what is done now."""

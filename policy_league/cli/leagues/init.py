@@ -77,8 +77,6 @@ def init(
         part.write_text(proposal.text, encoding="utf-8")
     examination = proposal.examination
     say(f"{examination.policies}\n{examination.actions}")
-    if examination.views and len(proposal.config.sides or ()) != 1:
-        say(examination.views)
     if proposal.config.play.actions == "greedy" and examination.openings is not None:
         say(str(examination.openings))
     for finding in examination.findings:

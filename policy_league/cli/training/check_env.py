@@ -57,7 +57,7 @@ def _show(league: "LeagueConfig", found: "Examination") -> None:
             f"{league.environment.entry_point}: {found.api}, {counted(found.agents, 'agent')}, {state}, episodes of"
             f" {_lengths(found)}, {found.steps_per_second:,.{found.steps_per_second < 10:d}f} steps per second"
         )
-        say("\n".join(filter(None, (found.implementation, found.policies, found.actions, found.views))))
+        say("\n".join(filter(None, (found.implementation, found.policies, found.actions))))
         if (openings := found.openings) is not None:
             say(str(openings))
             if (plies := league.play.opening_plies) != openings.recommended and 0 < plies <= len(openings.lengths):
