@@ -184,12 +184,10 @@ def _sides(interface: Interface, is_team: bool) -> str:
 
 def _play(config: LeagueConfig, examination: Examination, interface: Interface, is_team: bool) -> dict[str, str]:
     measured, plies = examination.openings, 0
-    actions, selection = "greedy", "the most likely ones, as there is no opponent"
-    if not is_team:
-        actions, selection = (
-            action_selection(config, interface),
-            "the most likely ones; sampled if information is hidden",
-        )
+    actions = "greedy" if is_team else action_selection(config, interface)
+    selection = (
+        f"the most likely ones{', as there is no opponent' if is_team else '; sampled if information is hidden'}"
+    )
     if actions == "sampled":
         hides = interface.hidden_information
         selection = f"drawn at random, as {'the environment hides information' if hides else 'opponents act at once'}"
