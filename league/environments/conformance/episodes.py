@@ -6,7 +6,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import closing
 from typing import Any
 
@@ -226,19 +225,19 @@ class Examiner:
 
     def _check_thread(self, episode: Recording) -> None:
         """Play an episode, which a new environment has played here, outside of the main thread, as training does."""
-        outcome: Future[Recording] = Future()
+        errors: list[Exception] = []
 
         def play() -> None:
             try:
-                outcome.set_result(self._anew(episode, FIRST))
-            except BaseException as error:
-                outcome.set_exception(error)
+                with no_exit:
+                    self._anew(episode, FIRST)
+            except Exception as error:
+                errors.append(error)
 
-        threading.Thread(target=play, name="episode", daemon=True).start()
-        try:
-            with no_exit:
-                outcome.result()
-        except Exception as error:
+        thread = threading.Thread(target=play, name="episode", daemon=True)
+        thread.start()
+        thread.join()
+        for error in errors:
             where = "".join(f"{line}, " for line in [raised_at(error)] if line)
             self._examination.add(
                 "fault",
