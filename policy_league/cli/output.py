@@ -5,7 +5,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -194,26 +194,29 @@ def elo(rating: float | None, interval: Sequence[float] | None) -> str | None:
     return f"{rating:+.0f}{span}"
 
 
-SECONDS_PER_LINE = 10.0
-"""Seconds between two lines of progress, where there is no bar."""
+SECONDS_PER_LINE, SECONDS_PER_UPDATE = 10.0, 0.5
+"""Between two lines of progress, where there is no bar, and two updates of a spinner."""
 
 
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[str], None]]:
-    """Return a function that shows what is done now: beside a spinner in a terminal, in plain lines elsewhere."""
-    if errors.is_terminal:
-        with errors.status(Text(title)) as status:
-            yield lambda doing: status.update(Text(text(f"{title}: {doing}")))
-        return
-    next_line = time.monotonic() + SECONDS_PER_LINE
+    """Return a function that shows what is done now, which may be called often: beside a spinner in a terminal, in
+    plain lines elsewhere.
+    """
+    with errors.status(Text(title)) if errors.is_terminal else nullcontext() as status:
+        interval = SECONDS_PER_LINE if status is None else SECONDS_PER_UPDATE
+        next_time = time.monotonic() + interval
 
-    def show(doing: str) -> None:
-        nonlocal next_line
-        if time.monotonic() >= next_line:
-            next_line = time.monotonic() + SECONDS_PER_LINE
-            complain(f"{title}: {doing}")
+        def show(doing: str) -> None:
+            nonlocal next_time
+            if time.monotonic() >= next_time:
+                next_time = time.monotonic() + interval
+                if status is None:
+                    complain(f"{title}: {doing}")
+                else:
+                    status.update(Text(text(f"{title}: {doing}")))
 
-    yield show
+        yield show
 
 
 class GameProgress:

@@ -46,7 +46,7 @@ def examine(
     seed: int = 0,
     *,
     seconds: float | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Examination:
     """Play and check episodes with random legal actions. Never raises exceptions of the environment.
 
@@ -57,7 +57,7 @@ def examine(
             a fault.
         seed: Seed of the first episode.
         seconds: Time after which the checks are cut short, which a note says. None: they take as long as they need.
-        progress: Receives what is done, at most twice per second.
+        progress: Receives what is done, at each step.
 
     Returns:
         The findings, with the lengths of the episodes, the speed and the effect of random openings.

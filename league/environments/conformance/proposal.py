@@ -103,7 +103,7 @@ def propose(
     *,
     is_team: bool | None = None,
     seconds: float | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Proposal:
     """Examine an environment and propose a configuration.
 
@@ -115,7 +115,7 @@ def propose(
         shown: This folder relative to the file; None if it is that of the file.
         is_team: Whether all agents are one side. None: if only a team's returns agree so well.
         seconds: Time after which the examination is cut short.
-        progress: Receives what is done.
+        progress: Receives what is done, at each step.
 
     Raises:
         ConfigError: The environment cannot be built, or violates the contract.
