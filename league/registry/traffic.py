@@ -22,7 +22,7 @@ from league.registry.storage import change_counter
 from league.registry.storage.database import Repository, as_method, reading, upsert, writing
 from league.registry.storage.idempotency import IdempotentCall, apply_once
 from league.registry.storage.rows import Portion, ShadowCounts, Traffic
-from league.registry.storage.tables import ShadowCountTable, TrafficEventTable
+from league.registry.storage.tables import TrafficEventTable
 
 SHADOW_COUNTS_KEPT = timedelta(days=90)
 COUNTERS = ("requests", "observations", "agreed", "failed", "dropped", "skipped")
@@ -103,9 +103,9 @@ class TrafficRepository(Repository):
     @reading
     def shadow_counts(self, session: Session, league: str) -> list[ShadowCounts]:
         """Return the shadow counters of a league, summed over replicas, by candidate and champion."""
-        table = ShadowCountTable
+        table = ShadowCounts
         query = select(table).filter_by(league=league).order_by(table.candidate, table.champion)
-        counts_by_pair: dict[tuple[int, int], list[ShadowCountTable]] = {}
+        counts_by_pair: dict[tuple[int, int], list[ShadowCounts]] = {}
         for count in session.scalars(query):
             counts_by_pair.setdefault((count.candidate, count.champion), []).append(count)
         return [_sum(league, *pair, counts) for pair, counts in counts_by_pair.items()]
@@ -117,10 +117,10 @@ def write_shadow_counts(session: Session, replica: str, counts: Collection[Shado
         return
     written_at = datetime.now(UTC)
     for count in counts:
-        values = asdict(count)
-        key = {"replica": replica} | {name: values.pop(name) for name in ("league", "candidate", "champion")}
-        upsert(session, ShadowCountTable, key, values | {"latency": list(count.latency), "at": written_at})
-    session.execute(delete(ShadowCountTable).where(ShadowCountTable.at < written_at - SHADOW_COUNTS_KEPT))
+        values = asdict(count) | {"replica": replica, "at": written_at}
+        key = {name: values.pop(name) for name in ("replica", "league", "candidate", "champion")}
+        upsert(session, ShadowCounts, key, values)
+    session.execute(delete(ShadowCounts).where(ShadowCounts.at < written_at - SHADOW_COUNTS_KEPT))
 
 
 def end(session: Session, league: str, portions: Collection[str], *, actor: str, reason: str) -> None:
@@ -175,9 +175,9 @@ def _portion(version: str | None, share: float | None) -> Portion | None:
     return None if version is None or share is None else Portion(parse_version(version), share)
 
 
-def _sum(league: str, candidate: int, champion: int, counts: list[ShadowCountTable]) -> ShadowCounts:
+def _sum(league: str, candidate: int, champion: int, counts: list[ShadowCounts]) -> ShadowCounts:
     latency = Histogram()
     for count in counts:
         latency.merge(count.latency, count.ns)
     sums = {name: sum(getattr(count, name) for count in counts) for name in COUNTERS}
-    return ShadowCounts(league, candidate, champion, **sums, latency=tuple(latency.counts), ns=latency.ns)
+    return ShadowCounts(league, candidate, champion, **sums, latency=latency.counts, ns=latency.ns)

@@ -132,7 +132,7 @@ class Shadow:
                 counts.failed,
                 counts.dropped,
                 counts.skipped,
-                tuple(counts.latency.counts),
+                list(counts.latency.counts),
                 counts.latency.ns,
             )
             for pair, counts in sorted(self._counts.items())

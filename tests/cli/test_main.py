@@ -326,7 +326,7 @@ def used(registry: Registry) -> Registry:
         registry.replicas.register(replica, {})
     counts = dict.fromkeys(("requests", "observations", "agreed"), 1_234_567)
     shadow = ShadowCounts(
-        name, 3, 2, **counts, failed=12, dropped=1200, skipped=0, latency=tuple(Histogram().counts), ns=10**9
+        name, 3, 2, **counts, failed=12, dropped=1200, skipped=0, latency=Histogram().counts, ns=10**9
     )
     with registry.database.write() as session:
         write_shadow_counts(session, "policy-server-0/replica-1f0e2a7b", [shadow])

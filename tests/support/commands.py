@@ -283,7 +283,7 @@ def _build(home: Path) -> Registry:
     registry.keys.revoke("revoked")
     registry.replicas.register("alive", {URL: "http://127.0.0.1:30001"})
     registry.replicas.register("silent", {})
-    latency = (0,) * 4 + (90, 10) + (0,) * 14
+    latency = [0] * 4 + [90, 10] + [0] * 14
     counts = ShadowCounts("board", 3, 2, 100, 120, 90, failed=3, dropped=2, skipped=1, latency=latency, ns=10**7)
     registry.replicas.write_report("alive", {}, [counts])
     silence(registry, "silent", timedelta(hours=1))

@@ -34,6 +34,7 @@ from league.registry.storage.rows import (
     LeagueRow,
     NightlyRunRow,
     RunRow,
+    ShadowCounts,
     SnapshotRow,
     StrengthRow,
     VerdictRow,
@@ -51,7 +52,6 @@ from league.registry.storage.tables import (
     PairSumTable,
     ScheduleTable,
     ScheduleTotalTable,
-    ShadowCountTable,
     TrafficEventTable,
     VersionNoteTable,
     VersionTable,
@@ -265,7 +265,7 @@ def _delete_dependents(session: Session, league: str, number: int, found: _Depen
         while event.beneath is not None and event.beneath in gone:
             event.beneath = events[event.beneath].beneath
     session.flush()
-    ref, strength, counts, schedule = f"{league}@{number}", StrengthRow, ShadowCountTable, ScheduleTable
+    ref, strength, counts, schedule = f"{league}@{number}", StrengthRow, ShadowCounts, ScheduleTable
     sums = (ScheduleTotalTable, PairSumTable, GameDigestTable)
     of_results: tuple[Executable, ...] = (
         delete(AliasEvent).where(AliasEvent.id.in_(gone)),

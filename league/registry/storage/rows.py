@@ -296,29 +296,36 @@ class Traffic:
     at: datetime | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ShadowCounts:
-    """Comparison of a shadow with the champion on mirrored requests."""
+class ShadowCounts(Record):
+    """Comparison of a shadow with the champion on mirrored requests: since a replica started, or the sums over all."""
 
-    league: str
-    candidate: int
-    champion: int
-    requests: int
+    __tablename__ = "shadow_counts"
+    __table_args__ = (
+        ForeignKeyConstraint(["league", "candidate"], ["versions.league", "versions.number"]),
+        ForeignKeyConstraint(["league", "champion"], ["versions.league", "versions.number"]),
+    )
+
+    league: Mapped[str] = mapped_column(String(255), primary_key=True)
+    candidate: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    champion: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
+    requests: Mapped[int] = mapped_column(BigInteger)
     """Mirrored requests that were compared."""
-    observations: int
+    observations: Mapped[int] = mapped_column(BigInteger)
     """Observations in those requests."""
-    agreed: int
+    agreed: Mapped[int] = mapped_column(BigInteger)
     """Observations with the same action; if actions are sampled, with the same random numbers."""
-    failed: int
+    failed: Mapped[int] = mapped_column(BigInteger)
     """Requests that failed on the candidate."""
-    dropped: int
+    dropped: Mapped[int] = mapped_column(BigInteger)
     """Requests that were not mirrored because the queue was full."""
-    skipped: int
+    skipped: Mapped[int] = mapped_column(BigInteger)
     """Requests that cannot be mirrored because their recurrent state belongs to another network."""
-    latency: tuple[int, ...]
+    latency: Mapped[list[int]]
     """Histogram (buckets of league/histograms.py) of the candidate's computing time per request."""
-    ns: int
+    ns: Mapped[int] = mapped_column(BigInteger)
     """Sum of those times in nanoseconds."""
+    replica: Mapped[str] = mapped_column(String(255), primary_key=True, init=False, compare=False)
+    at: Mapped[datetime] = mapped_column(index=True, init=False, compare=False)
 
     @property
     def agreement(self) -> float | None:

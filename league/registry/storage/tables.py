@@ -208,30 +208,6 @@ class TrafficEventTable(Base):
     at: Mapped[datetime]
 
 
-class ShadowCountTable(Base):
-    """Counters of a replica for a shadow since the replica started, see ShadowCounts."""
-
-    __tablename__ = "shadow_counts"
-    __table_args__ = (
-        ForeignKeyConstraint(["league", "candidate"], ["versions.league", "versions.number"]),
-        ForeignKeyConstraint(["league", "champion"], ["versions.league", "versions.number"]),
-    )
-
-    replica: Mapped[str] = mapped_column(String(255), primary_key=True)
-    league: Mapped[str] = mapped_column(String(255), primary_key=True)
-    candidate: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    champion: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
-    requests: Mapped[int] = mapped_column(BigInteger)
-    observations: Mapped[int] = mapped_column(BigInteger)
-    agreed: Mapped[int] = mapped_column(BigInteger)
-    failed: Mapped[int] = mapped_column(BigInteger)
-    dropped: Mapped[int] = mapped_column(BigInteger)
-    skipped: Mapped[int] = mapped_column(BigInteger)
-    latency: Mapped[list[int]]
-    ns: Mapped[int] = mapped_column(BigInteger)
-    at: Mapped[datetime] = mapped_column(index=True)
-
-
 class ReplicaReportTable(Base):
     """Metrics of a replica, written by serve_app/observability/metrics.py."""
 

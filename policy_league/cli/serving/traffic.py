@@ -138,7 +138,9 @@ def _show(registry: "Registry", league: str, as_json: bool) -> None:
 
 
 def _document(one: "ShadowCounts") -> dict[str, Any]:
-    document = {name: value for name, value in asdict(one).items() if name not in ("latency", "ns", "league")}
+    from league.registry.traffic import COUNTERS
+
+    document = {name: getattr(one, name) for name in ("candidate", "champion", *COUNTERS)}
     quantiles = {"p50": one.milliseconds(0.5), "p95": one.milliseconds(0.95)}
     return document | {"agreement": one.agreement, "latency_ms": quantiles}
 

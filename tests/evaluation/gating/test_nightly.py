@@ -313,9 +313,7 @@ def show(registry: Registry, candidate: int, champion: int, agreed: int, tail: i
     """Report 100 observations of a shadow that took 50 µs, and `tail` that took up to 250 ms."""
     latency = [0] * (len(BOUNDS) + 1)
     latency[1], latency[BOUNDS.index(250_000)] = 100, tail
-    counts = ShadowCounts(
-        LEAGUE, candidate, champion, 100 + tail, 100 + tail, agreed, 0, 0, 0, tuple(latency), 4_000_000
-    )
+    counts = ShadowCounts(LEAGUE, candidate, champion, 100 + tail, 100 + tail, agreed, 0, 0, 0, latency, 4_000_000)
     registry.replicas.write_report(f"replica-{champion}", {}, [counts])
 
 

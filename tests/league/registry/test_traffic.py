@@ -44,7 +44,7 @@ def test_only_existing_versions_get_traffic(versioned: Registry) -> None:
 
 def shadow_counts(candidate: int = 2, requests: int = 10, **counts: int) -> ShadowCounts:
     fields = {"observations": 2 * requests, "agreed": requests, "failed": 0, "dropped": 0, "skipped": 0} | counts
-    latency = (requests, *EMPTY[1:])
+    latency = [requests, *EMPTY[1:]]
     return ShadowCounts(LEAGUE, candidate, 1, requests, **fields, latency=latency, ns=requests * 1000)
 
 

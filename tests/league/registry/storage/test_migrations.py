@@ -132,7 +132,7 @@ def test_what_version_0_1_0_wrote_is_read(storage: Storage) -> None:
         (setting,) = registry.traffic.history(LEAGUE)
         assert (setting.canary, setting.shadow) == (Portion(2, 0.25), Portion("candidate", 0.5))
         (counts,) = registry.traffic.shadow_counts(LEAGUE)
-        assert (counts.agreement, counts.latency[:3]) == (0.75, (1, 2, 3))
+        assert (counts.agreement, counts.latency[:3]) == (0.75, [1, 2, 3])
         evaluation = registry.evaluations.get(LEAGUE, 1)
         assert (evaluation.state, evaluation.request["blocks"], evaluation.result) == ("done", 2, {"matches": 4})
         training = registry.runs.get(LEAGUE, "run")
