@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from league.errors import InvalidReference, did_you_mean
+from league.errors import did_you_mean
 from league.frozen import FrozenModel
 from league.refs import of_league, parse_ref
 
@@ -34,10 +34,7 @@ class Part(FrozenModel, allow_inf_nan=False):
 
 
 def _check_contestant(ref: str) -> str:
-    try:
-        parse_ref(of_league(ref, "league"))
-    except InvalidReference as error:
-        raise ValueError(str(error)) from error
+    parse_ref(of_league(ref, "league"))
     return ref
 
 

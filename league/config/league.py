@@ -18,7 +18,7 @@ from league.config.training import NightlyConfig, TrainingSettings
 from league.config.validation_errors import describe_validation_error, describe_yaml_error
 from league.entry_points import search_in
 from league.environment_code import environment_code
-from league.errors import ConfigError, InvalidReference
+from league.errors import ConfigError
 from league.interface import digest
 from league.refs import check_slug
 
@@ -60,7 +60,7 @@ class LeagueConfig(Part):
     @field_validator("league")
     @classmethod
     def _league_is_slug(cls, value: str) -> str:
-        return _slug("league", value)
+        return check_slug("league", value)
 
     @field_validator("policies", "sides")
     @classmethod
@@ -70,7 +70,7 @@ class LeagueConfig(Part):
         if isinstance(value, dict) and not value:
             raise ValueError("expected at least one entry")
         for key in value if isinstance(value, dict) else ():
-            _slug("name", key)
+            check_slug("name", key)
         return value
 
     @field_validator("training")
@@ -240,10 +240,3 @@ def _large_integers(value: Any, key: str = "") -> Iterator[str]:
             yield from _large_integers(item, f"{key}.{index}")
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
         yield f"{key}: {str(value)[:32]}"
-
-
-def _slug(kind: str, value: str) -> str:
-    try:
-        return check_slug(kind, value)
-    except InvalidReference as error:
-        raise ValueError(str(error)) from error

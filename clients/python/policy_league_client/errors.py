@@ -29,8 +29,11 @@ class ConfigError(InvalidInput, code="invalid_config"):
     """A configuration is invalid. The message names the file, the key and the expected value."""
 
 
-class InvalidReference(InvalidInput, code="invalid_reference"):
-    """A reference is malformed. Valid ones: `connect_four@3`, `connect_four@champion`, `script:random`."""
+class InvalidReference(InvalidInput, ValueError, code="invalid_reference"):
+    """A reference is malformed. Valid ones: `connect_four@3`, `connect_four@champion`, `script:random`.
+
+    A ValueError, so that a model of Pydantic that contains a reference reports it as a fault of its field.
+    """
 
 
 class ObservationError(InvalidInput, code="invalid_observation"):
