@@ -17,7 +17,7 @@ from league.refs import CheckpointRef
 from league.registry import leagues
 from league.registry.registry import Registry
 from league.registry.storage import tables
-from league.registry.storage.database import insert, upsert_all
+from league.registry.storage.database import Repository, as_method, insert, reading, upsert_all, writing
 from league.results.records import (
     BlockResult,
     LedgerEntry,
@@ -42,47 +42,54 @@ STRIDE = 1000
 """Matches per query when iterating over a schedule."""
 
 
-class Ledger:
+def _schedules(session: Session, league: str, only: str | None = None) -> list[Schedule]:
+    """Return all schedules of a league in the order in which they were opened, or `only` one. Raises UnknownLeague."""
+    leagues.require(session, league)
+    query = select(tables.ScheduleTable.document).filter_by(league=league).order_by(tables.ScheduleTable.sequence)
+    if only is not None:
+        query = query.filter_by(id=only)
+    return [load_schedule(document) for document in session.scalars(query)]
+
+
+def _schedule(session: Session, schedule: str) -> Schedule:
+    """Return one schedule. Raises NotFound."""
+    document = session.scalar(select(tables.ScheduleTable.document).filter_by(id=schedule))
+    if document is None:
+        raise NotFound(f"there is no schedule {schedule!r}")
+    return load_schedule(document)
+
+
+class Ledger(Repository):
     """Schedules and their matches in the registry's database. Raises StorageError if the database fails."""
 
     def __init__(self, registry: Registry) -> None:
-        self._database = registry.database
+        super().__init__(registry.database)
 
-    def open(self, schedule: Schedule) -> Schedule:
+    @writing
+    def open(self, session: Session, schedule: Schedule) -> Schedule:
         """Store a schedule unless its id exists; returns the stored one. Raises UnknownLeague."""
         row = {"id": schedule.id, "league": schedule.league, "kind": schedule.kind, "document": dump_schedule(schedule)}
-        with self._database.write() as session:
-            leagues.require(session, schedule.league)
-            insert(session, tables.ScheduleTable, [row | {"opened_at": datetime.now(UTC)}])
-            stored = _schedule(session, schedule.id)
-            insert(session, tables.ScheduleTotalTable, [ScheduleSums(stored).total()])
-            return stored
+        leagues.require(session, schedule.league)
+        insert(session, tables.ScheduleTable, [row | {"opened_at": datetime.now(UTC)}])
+        stored = _schedule(session, schedule.id)
+        insert(session, tables.ScheduleTotalTable, [ScheduleSums(stored).total()])
+        return stored
 
-    def schedules(self, league: str) -> list[Schedule]:
-        """Return all schedules of a league in the order in which they were opened. Raises UnknownLeague."""
-        with self._database.read() as session:
-            return _schedules(session, league)
+    schedules = as_method(_schedules)
+    schedule = as_method(_schedule)
 
-    def purged(self, league: str) -> set[str]:
+    @reading
+    def purged(self, session: Session, league: str) -> set[str]:
         """Return the ids of the purged schedules of a league, whose matches are not counted."""
         table = tables.ScheduleTable
-        with self._database.read() as session:
-            return set(session.scalars(select(table.id).where(table.league == league, table.purged_at.is_not(None))))
+        return set(session.scalars(select(table.id).where(table.league == league, table.purged_at.is_not(None))))
 
-    def schedule(self, schedule: str) -> Schedule:
-        """Return one schedule. Raises NotFound."""
-        with self._database.read() as session:
-            return _schedule(session, schedule)
-
-    def purge(self, schedules: Collection[str]) -> None:
+    @writing
+    def purge(self, session: Session, schedules: Collection[str]) -> None:
         """Exclude the matches of these schedules from all results. They are kept and can be replayed."""
-        with self._database.write() as session:
-            table = tables.ScheduleTable
-            session.execute(
-                update(table)
-                .where(table.id.in_(schedules), table.purged_at.is_(None))
-                .values(purged_at=datetime.now(UTC))
-            )
+        table = tables.ScheduleTable
+        of_these = update(table).where(table.id.in_(schedules), table.purged_at.is_(None))
+        session.execute(of_these.values(purged_at=datetime.now(UTC)))
 
     def extend(self, matches: Sequence[Match]) -> int:
         """Store matches, all or none; returns the number of new ones.
@@ -124,8 +131,7 @@ class Ledger:
 
     def matches(self, *, league: str, schedule: str | None = None) -> list[Match]:
         """Return the matches of a league, or of one of its schedules, in schedule order."""
-        with self._database.read() as session:
-            schedules = _schedules(session, league, schedule)
+        schedules = self.schedules(league, schedule)
         return [match for league_schedule in schedules for match in self.walk(league_schedule)]
 
     def walk(self, schedule: Schedule) -> Iterator[Match]:
@@ -147,18 +153,25 @@ class Ledger:
         """Return one match. Raises UnknownMatch."""
         return self.scheduled_match(match)[1]
 
-    def scheduled_match(self, match: str) -> tuple[Schedule, Match]:
+    @reading
+    def scheduled_match(self, session: Session, match: str) -> tuple[Schedule, Match]:
         """Return one match with its schedule. Raises UnknownMatch."""
         name, position = _place(match)
-        with self._database.read() as session:
-            moves = session.scalar(select(tables.MatchTable.moves).filter_by(schedule=name, position=position))
-            if moves is None:
-                raise _no_match(match)
-            schedule = _schedule(session, name)
-            return schedule, schedule.match(position, load_games(moves))
+        moves = session.scalar(select(tables.MatchTable.moves).filter_by(schedule=name, position=position))
+        if moves is None:
+            raise _no_match(match)
+        schedule = _schedule(session, name)
+        return schedule, schedule.match(position, load_games(moves))
 
+    @reading
     def page(
-        self, league: str, *, contestants: tuple[str, str] | None = None, before: str | None = None, limit: int = 20
+        self,
+        session: Session,
+        league: str,
+        *,
+        contestants: tuple[str, str] | None = None,
+        before: str | None = None,
+        limit: int = 20,
     ) -> list[LedgerEntry]:
         """Return at most `limit` matches of a league without moves, newest first, purged ones included.
 
@@ -167,51 +180,48 @@ class Ledger:
         """
         table = tables.MatchTable
         orders = dict.fromkeys((contestants, contestants[::-1])) if contestants else ()
-        with self._database.read() as session:
-            leagues.require(session, league)
-            query = select(*_LISTED).where(table.league == league)
-            if before is not None:
-                schedule, position = _place(before)
-                when = select(*_PLAYED).filter_by(league=league, schedule=schedule, position=position)
-                if (sort_key := session.execute(when).first()) is None:
-                    raise InvalidInput(f"before: league {league} has no match {before!r}")
-                query = query.where(tuple_(*_PLAYED) < tuple(sort_key))
-            query = query.order_by(*(column.desc() for column in _PLAYED)).limit(limit)
-            # Each order of the contestants is a query of its own, because it is then a range of an index.
-            parts = [query.where(table.first == first, table.second == second) for first, second in orders] or [query]
-            return _entries(session, union_all(*(select(part.subquery()) for part in parts)).subquery(), limit)
+        leagues.require(session, league)
+        query = select(*_LISTED).where(table.league == league)
+        if before is not None:
+            schedule, position = _place(before)
+            when = select(*_PLAYED).filter_by(league=league, schedule=schedule, position=position)
+            if (sort_key := session.execute(when).first()) is None:
+                raise InvalidInput(f"before: league {league} has no match {before!r}")
+            query = query.where(tuple_(*_PLAYED) < tuple(sort_key))
+        query = query.order_by(*(column.desc() for column in _PLAYED)).limit(limit)
+        # Each order of the contestants is a query of its own, because it is then a range of an index.
+        parts = [query.where(table.first == first, table.second == second) for first, second in orders] or [query]
+        return _entries(session, union_all(*(select(part.subquery()) for part in parts)).subquery(), limit)
 
-    def entry(self, match: str) -> LedgerEntry:
+    @reading
+    def entry(self, session: Session, match: str) -> LedgerEntry:
         """Return one match without moves. Raises UnknownMatch."""
         schedule, position = _place(match)
-        with self._database.read() as session:
-            one = select(*_LISTED).filter_by(schedule=schedule, position=position)
-            entries = _entries(session, one.subquery(), limit=1)
+        one = select(*_LISTED).filter_by(schedule=schedule, position=position)
+        entries = _entries(session, one.subquery(), limit=1)
         if not entries:
             raise _no_match(match)
         return entries[0]
 
-    def positions(self, schedule: str) -> set[int]:
+    @reading
+    def positions(self, session: Session, schedule: str) -> set[int]:
         """Return the positions of a schedule that were played."""
-        with self._database.read() as session:
-            return set(session.scalars(select(tables.MatchTable.position).filter_by(schedule=schedule)))
+        return set(session.scalars(select(tables.MatchTable.position).filter_by(schedule=schedule)))
 
-    def counts(self, league: str) -> dict[str, int]:
+    @reading
+    def counts(self, session: Session, league: str) -> dict[str, int]:
         """Return schedule → number of played matches, of the schedules of a league that have any."""
         total = tables.ScheduleTotalTable
         query = select(total.schedule, total.matches).where(total.league == league, total.matches > 0)
-        with self._database.read() as session:
-            return dict(session.execute(query).tuples().all())
+        return dict(session.execute(query).tuples().all())
 
-    def has_played(self, ref: str, conditions: Conditions) -> bool:
+    @reading
+    def has_played(self, session: Session, ref: str, conditions: Conditions) -> bool:
         """Return whether a version has a match under these conditions, also if it is not counted."""
         pair = tables.PairSumTable
         league = CheckpointRef.parse(ref).league
         query = select(pair.schedule).where(pair.league == league, or_(pair.first == ref, pair.second == ref))
-        with self._database.read() as session:
-            return any(
-                _schedule(session, schedule).conditions == conditions for schedule in session.scalars(query).all()
-            )
+        return any(_schedule(session, schedule).conditions == conditions for schedule in session.scalars(query).all())
 
     def counted(self, league: str, conditions: Conditions) -> list[Schedule]:
         """Return the schedules of a league that were played under these conditions, in the order of their opening.
@@ -247,15 +257,15 @@ class Ledger:
         query = select(pair.schedule, pair.first, pair.second, pair.examples).filter_by(league=league)
         return self._texts(query, schedules)
 
+    @reading
     def _texts(
-        self, query: Select[str, str, str, str], schedules: Iterable[Schedule]
+        self, session: Session, query: Select[str, str, str, str], schedules: Iterable[Schedule]
     ) -> dict[Pair, list[tuple[str, str]]]:
         """Pair → schedule and text, of these schedules. query: schedules, contestants and texts."""
         names, texts = {schedule.id for schedule in schedules}, defaultdict[Pair, list[tuple[str, str]]](list)
-        with self._database.read() as session:
-            for name, first, second, text in session.execute(query).tuples():
-                if name in names:
-                    texts[first, second].append((name, text))
+        for name, first, second, text in session.execute(query).tuples():
+            if name in names:
+                texts[first, second].append((name, text))
         return dict(texts)
 
     def digests(self, league: str) -> Iterator[tuple[str, int, bytes]]:
@@ -273,21 +283,6 @@ _LISTED = tuple(
 )
 _PLAYED = tables.MatchTable.played_at, tables.MatchTable.schedule, tables.MatchTable.position
 """Sort key for the order in which matches were played."""
-
-
-def _schedules(session: Session, league: str, only: str | None = None) -> list[Schedule]:
-    leagues.require(session, league)
-    query = select(tables.ScheduleTable.document).filter_by(league=league).order_by(tables.ScheduleTable.sequence)
-    if only is not None:
-        query = query.filter_by(id=only)
-    return [load_schedule(document) for document in session.scalars(query)]
-
-
-def _schedule(session: Session, name: str) -> Schedule:
-    document = session.scalar(select(tables.ScheduleTable.document).filter_by(id=name))
-    if document is None:
-        raise NotFound(f"there is no schedule {name!r}")
-    return load_schedule(document)
 
 
 def _matches(schedule: Schedule, rows: Sequence[Any]) -> list[Match]:
