@@ -1,6 +1,6 @@
 """Base of all sections of a configuration."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, ValidationError, model_validator
@@ -31,6 +31,12 @@ class Part(FrozenModel, allow_inf_nan=False):
         if faults:
             raise ValidationError.from_exception_data(cls.__name__, faults)
         return value
+
+    def refuse(self, settings: Iterable[str], problem: str) -> None:
+        """Raise ValueError for the first of some settings that is not its default. problem: with {} for its name."""
+        for name in settings:
+            if getattr(self, name) != type(self).model_fields[name].get_default():
+                raise ValueError(problem.format(name))
 
 
 def _check_contestant(ref: str) -> str:

@@ -38,6 +38,8 @@ ADAPTERS = {"openspiel": "league.environments.openspiel"}
 """Short entry points of adapters for other libraries → their modules."""
 EXTERNAL = "external"
 """The entry point of games that run in simulators."""
+IN_PYTHON = "{} is for games in Python: a simulator applies its own"
+"""What is wrong with a setting of such a game."""
 
 
 class EnvironmentConfig(Part):
@@ -76,9 +78,8 @@ class EnvironmentConfig(Part):
             raise ValueError(
                 "a game is either external or has another entry_point: expected environment.external without it"
             )
-        python = [name for name in ("api", "kwargs", "wrappers", "vector", "revision") if getattr(self, name)]
-        if self.external is not None and python:
-            raise ValueError(f"{python[0]} is for games in Python: a simulator applies its own")
+        if self.external is not None:
+            self.refuse(("api", "kwargs", "wrappers", "vector", "revision"), IN_PYTHON)
         return self
 
     def search_in(self, folder: str | None) -> None:

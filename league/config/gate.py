@@ -123,7 +123,18 @@ class GateConfig(Part):
     def _ordered(self) -> Self:
         margins = [self.margin, *self._anchor_margins("at_least").values()]
         if self.model == "returns":
-            self._check_returns(max(margins))
+            if self.return_bound is None:
+                raise ValueError("model: returns requires return_bound, the maximum difference of returns in a block")
+            if not -self.return_bound < self.return0 <= self.return1 < self.return_bound:
+                raise ValueError(
+                    f"return0 and return1 must lie within ±{self.return_bound:g} (return_bound), return0 first,"
+                    f" got {self.return0:g} and {self.return1:g}"
+                )
+            if max(margins) >= self.return_bound:
+                raise ValueError(
+                    f"margin, which is a return with model: returns, must be smaller than return_bound"
+                    f" ({self.return_bound:g}), got {max(margins):g}"
+                )
             return self
         if not self.elo0 < self.elo1:
             raise ValueError(f"elo1 must be greater than elo0 ({self.elo0:g})")
@@ -133,20 +144,6 @@ class GateConfig(Part):
                 f" got {self.elo0:g}, {self.elo1:g} and {max(margins):g}"
             )
         return self
-
-    def _check_returns(self, margin: float) -> None:
-        if self.return_bound is None:
-            raise ValueError("model: returns requires return_bound, the maximum difference of returns in a block")
-        if not -self.return_bound < self.return0 <= self.return1 < self.return_bound:
-            raise ValueError(
-                f"return0 and return1 must lie within ±{self.return_bound:g} (return_bound), return0 first,"
-                f" got {self.return0:g} and {self.return1:g}"
-            )
-        if margin >= self.return_bound:
-            raise ValueError(
-                f"margin, which is a return with model: returns, must be smaller than return_bound"
-                f" ({self.return_bound:g}), got {margin:g}"
-            )
 
     @model_validator(mode="after")
     def _margins_are_possible(self) -> Self:

@@ -9,7 +9,7 @@ from pydantic import ValidationError, field_validator, model_validator
 
 from league.config.algorithms import IMPORTED, TrainingConfig
 from league.config.base import JSON, Part
-from league.config.environment import EnvironmentConfig
+from league.config.environment import IN_PYTHON, EnvironmentConfig
 from league.config.gate import GateConfig
 from league.config.play import PlayConfig
 from league.config.ppo import PPOConfig
@@ -89,12 +89,10 @@ class LeagueConfig(Part):
 
     @model_validator(mode="after")
     def _simulators_have_no_arguments(self) -> Self:
-        training = self.training
-        in_python = [name for name in ("curriculum", "wrappers") if getattr(training, name)]
-        if self.environment.external is not None and in_python:
-            raise ValueError(f"training.{in_python[0]} is for games in Python: a simulator applies its own")
-        if self.environment.external is not None and training.runners not in ("auto", 0, 1):
-            raise ValueError(f"training.runners is {training.runners}: one process serves all simulators, expected 1")
+        if self.environment.external is not None:
+            self.training.refuse(("curriculum", "wrappers"), f"training.{IN_PYTHON}")
+            if (runners := self.training.runners) not in ("auto", 0, 1):
+                raise ValueError(f"training.runners is {runners}: one process serves all simulators, expected 1")
         return self
 
     @model_validator(mode="after")

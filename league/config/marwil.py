@@ -40,7 +40,5 @@ class MARWILConfig(PPOConfig):
 
     @model_validator(mode="after")
     def _has_an_effect(self) -> Self:
-        for name in self.unused:
-            if getattr(self, name) != type(self).model_fields[name].default:
-                raise ValueError(f"{name}: marwil learns from recorded games, on which it has no effect: remove it")
+        self.refuse(self.unused, "{}: marwil learns from recorded games, on which it has no effect: remove it")
         return self

@@ -85,13 +85,9 @@ class QLearningConfig(OffPolicyConfig):
     """Recurrent layer; null for none. With it, `batch_size` counts sequences."""
 
     @model_validator(mode="after")
-    def _probabilities(self) -> Self:
+    def _settings_fit(self) -> Self:
         if max(self.exploration.initial, self.exploration.final) > 1:
             raise ValueError("exploration: initial and final are probabilities of a random action, at most 1")
-        return self
-
-    @model_validator(mode="after")
-    def _sequences_fit(self) -> Self:
         if self.recurrence is not None and (self.n_step > 1 or self.priorities is not None):
             raise ValueError("recurrence requires n_step 1 and no priorities")
         return self

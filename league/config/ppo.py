@@ -100,19 +100,11 @@ class PPOConfig(TrainingSettings):
     """Policy id → settings that differ from the common ones."""
 
     @model_validator(mode="after")
-    def _minibatch_fits(self) -> Self:
+    def _settings_fit(self) -> Self:
         if self.minibatch_size > self.train_batch_size:
             raise ValueError(f"minibatch_size must be at most train_batch_size ({self.train_batch_size})")
-        return self
-
-    @model_validator(mode="after")
-    def _encoder_fits(self) -> Self:
         if self.shared_encoder and self.recurrence is not None:
             raise ValueError("shared_encoder does not support recurrence")
-        return self
-
-    @model_validator(mode="after")
-    def _magnet_fits(self) -> Self:
         if self.recurrence is not None and self.magnet is not None and self.magnet.ref != UNIFORM:
             raise ValueError(f"magnet.ref {self.magnet.ref} does not support recurrence: expected {UNIFORM}")
         return self

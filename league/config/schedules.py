@@ -1,8 +1,10 @@
 """Settings that change during training: linear, cosine and piecewise linear schedules."""
 
 import math
+from bisect import bisect_right
 from collections.abc import Mapping
 from itertools import pairwise
+from operator import itemgetter
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, Discriminator, Field, Tag
@@ -72,10 +74,8 @@ def scheduled_value(value: Scheduled, progress: ScheduleProgress) -> float:
         return value.at(progress)
     if not isinstance(value, tuple):
         return value
-    before = [point for point in value if point[0] <= progress.steps]
-    after = [point for point in value if point[0] > progress.steps]
-    if not before or not after:
-        return (before[-1] if before else after[0])[1]
-    (first, low), (second, high) = before[-1], after[0]
-    share = (progress.steps - first) / (second - first)
+    after = bisect_right(value, progress.steps, key=itemgetter(0))
+    # Before the first pair and after the last one, both are the same.
+    (first, low), (second, high) = value[max(after - 1, 0)], value[min(after, len(value) - 1)]
+    share = (progress.steps - first) / (second - first) if first < second else 0.0
     return (1 - share) * low + share * high

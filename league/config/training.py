@@ -221,9 +221,8 @@ class TrainingSettings(Part):
 
     @model_validator(mode="after")
     def _network_replaces_layers(self) -> Self:
-        for key in self.replaced_by_network if self.network is not None else ():
-            if getattr(self, key) != type(self).model_fields[key].get_default():
-                raise ValueError(f"network takes the place of {key}: remove one of them")
+        if self.network is not None:
+            self.refuse(self.replaced_by_network, "network takes the place of {}: remove one of them")
         return self
 
     @property
