@@ -13,7 +13,7 @@ Discrete actions are the raw ones plus `start`. For a Box element with two finit
 import numpy as np
 from numpy.typing import NDArray
 
-from league.errors import ConfigError, IllegalMask
+from league.errors import ConfigError
 from league.spaces import Box, Discrete, MultiDiscrete, Space
 from league.spaces.arrays import bounds, mask_size
 
@@ -85,9 +85,3 @@ def from_environment(actions: NDArray, space: Space) -> NDArray:
             scaled = (wide / 2 - low / 4 - high / 4) / (high / 4 - low / 4)
             return np.where(finite, scaled, wide).astype(np.float32).reshape(len(actions), -1)
     raise ConfigError(f"unsupported action space {space!r}: expected Discrete, MultiDiscrete or a Box of floats")
-
-
-def check_legal_action(mask: NDArray) -> None:
-    """Raise IllegalMask unless every row of an action mask (k, n) allows an action."""
-    if not mask.any(axis=1).all():
-        raise IllegalMask("action_mask allows no action: expected at least one 1")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import EnvironmentMismatch, UnknownPolicy
-from league.policies.actions import check_legal_action, to_environment
+from league.policies.actions import to_environment
 from league.policies.bots import Bot
 from league.policies.draws import Generators, UniformNumbers, choose, draw, elements
 from league.policies.line_games.mcts import MCTS
@@ -32,7 +32,7 @@ from league.spaces import (
     Space,
     inputs,
 )
-from league.spaces.arrays import bounds, mask_size
+from league.spaces.arrays import bounds, check_legal_action, mask_size
 
 
 def script(name: str, observation: Space, action: Space) -> Policy:

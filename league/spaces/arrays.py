@@ -59,6 +59,11 @@ def check_mask(mask: NDArray) -> None:
             return
     if ((mask != 0) & (mask != 1)).any():
         raise IllegalMask("action_mask contains values other than 0 and 1")
+    check_legal_action(mask)
+
+
+def check_legal_action(mask: NDArray) -> None:
+    """Raise IllegalMask unless each row of a mask (k, n) allows an action."""
     if not mask.any(axis=-1).all():
         raise IllegalMask("action_mask allows no action: expected at least one 1")
 

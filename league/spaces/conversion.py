@@ -97,9 +97,9 @@ def to_gymnasium(space: Space) -> gymnasium.Space[Any]:
 
 
 def _bound(bound: NDArray) -> Any:
-    if bound.size and (bound == bound.flat[0]).all():
-        return _finite(bound.flat[0].item())
-    return _nested(bound.tolist())
+    """One number if all elements have it, else nested lists; None in place of an infinite one."""
+    finite = np.where(np.isfinite(bound), bound, np.array(None))
+    return finite.flat[0] if bound.size and (bound == bound.flat[0]).all() else finite.tolist()
 
 
 def _unbound(bound: Any, infinity: float, space: Box) -> NDArray:
@@ -107,11 +107,3 @@ def _unbound(bound: Any, infinity: float, space: Box) -> NDArray:
     finite = np.array(bound, dtype=np.float64)
     exact = np.array(bound, dtype=space.dtype) if not np.isnan(finite).any() else np.nan_to_num(finite, nan=infinity)
     return np.broadcast_to(exact, space.shape).astype(space.dtype)
-
-
-def _nested(values: Any) -> Any:
-    return [_nested(value) for value in values] if isinstance(values, list) else _finite(values)
-
-
-def _finite(value: Any) -> Any:
-    return value if np.isfinite(value) else None

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import EnvironmentMismatch
-from league.policies.actions import check_legal_action
 from league.policies.draws import Generators, choose, draw
 from league.policies.policy import Actions, Arrays
 from league.spaces import ACTION_MASK, OBSERVATION, Discrete, Space, inputs
+from league.spaces.arrays import check_legal_action
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.errors import ConfigError, ObservationError
-from league.policies.actions import check_legal_action
 from league.policies.draws import Generators, draw
 from league.policies.line_games.game import CONNECT_FOUR, TIC_TAC_TOE, LineGame, line_game
 from league.policies.policy import Actions, Arrays
 from league.spaces import ACTION_MASK, OBSERVATION, Space
+from league.spaces.arrays import check_legal_action
 
 NAMES = {CONNECT_FOUR: "connect_four", TIC_TAC_TOE: "tic_tac_toe"}
 """The games' names in OpenSpiel."""
