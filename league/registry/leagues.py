@@ -2,16 +2,17 @@
 
 import json
 import logging
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
-from sqlalchemy import Select, select
-from sqlalchemy.orm import Session
+from sqlalchemy import Select, select, tuple_
+from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from league.conditions import ActionSelection, Conditions, action_selection, default_selection, game_changes
-from league.errors import InterfaceChanged, UnknownLeague, did_you_mean
+from league.errors import InterfaceChanged, InvalidInput, UnknownLeague, did_you_mean
 from league.interface import Interface, digest
 from league.refs import check_new
 from league.registry.storage import change_counter
@@ -159,6 +160,31 @@ def require(session: Session, league: str) -> None:
 def rows(session: Session, league: str, query: Select[Row]) -> list[Row]:
     """Return the rows of a query about a league. Raises UnknownLeague."""
     require(session, league)
+    return list(session.scalars(query))
+
+
+def newest(
+    session: Session,
+    league: str,
+    table: type[Row],
+    *,
+    what: str,
+    key: Sequence[InstrumentedAttribute[Any]],
+    before: str | None,
+    limit: int,
+) -> list[Row]:
+    """Return at most `limit` rows of a league, newest first.
+
+    what: a row, in words. key: columns that sort rows by age. before: return only rows older than that with this id.
+    Raises UnknownLeague, or InvalidInput if the league has no row `before`.
+    """
+    require(session, league)
+    query = select(table).filter_by(league=league).order_by(*(column.desc() for column in key)).limit(limit)
+    if before is not None:
+        last = session.execute(select(*key).filter_by(league=league, id=before)).first()
+        if last is None:
+            raise InvalidInput(f"before: league {league} has no {what} {before!r}")
+        query = query.where(tuple_(*key) < tuple(last))
     return list(session.scalars(query))
 
 

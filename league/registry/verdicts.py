@@ -8,10 +8,10 @@ from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import func, select, tuple_
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from league.errors import Conflict, InvalidInput, InvalidReference, UnknownVerdict
+from league.errors import Conflict, InvalidReference, UnknownVerdict
 from league.refs import SHORT_VERDICT, VERDICT, verdict_digest
 from league.registry import leagues, versions
 from league.registry.storage.database import Repository, insert, reading, writing
@@ -128,15 +128,8 @@ class VerdictRepository(Repository):
         before: return only verdicts opened before this one.
         Raises UnknownLeague, or InvalidInput if `before` is not a verdict of the league.
         """
-        table = VerdictRow
-        query = select(table).filter_by(league=league).order_by(table.opened_at.desc(), table.id.desc()).limit(limit)
-        leagues.require(session, league)
-        if before is not None:
-            last = session.get(table, before)
-            if last is None or last.league != league:
-                raise InvalidInput(f"before: league {league} has no verdict {before!r}")
-            query = query.where(tuple_(table.opened_at, table.id) < (last.opened_at, last.id))
-        return list(session.scalars(query))
+        key = VerdictRow.opened_at, VerdictRow.id
+        return leagues.newest(session, league, VerdictRow, what="verdict", key=key, before=before, limit=limit)
 
     @reading
     def last_closed(self, session: Session) -> dict[str, VerdictRow]:

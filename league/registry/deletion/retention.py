@@ -17,8 +17,6 @@ from datetime import UTC, datetime
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from league.errors import InvalidReference
-from league.refs import CheckpointRef, parse_ref
 from league.registry import leagues, traffic, versions
 from league.registry.storage import change_counter
 from league.registry.storage.artifacts import ArtifactStore
@@ -133,14 +131,5 @@ def _needed(session: Session, league: str) -> set[int]:
     counted = select(ScheduleTable).filter_by(league=league, purged_at=None)
     for schedule in session.scalars(counted):
         refs |= set(json.loads(schedule.document)["contestants"])
-    return needed | {number for ref in refs if (number := _number(ref, league)) is not None}
-
-
-def _number(ref: str, league: str) -> int | None:
-    try:
-        parsed = parse_ref(ref)
-    except InvalidReference:
-        return None
-    if isinstance(parsed, CheckpointRef) and parsed.league == league and isinstance(parsed.version, int):
-        return parsed.version
-    return None
+    fixed = (ref.partition("@") for ref in refs)
+    return needed | {int(number) for name, _, number in fixed if name == league and number.isdecimal()}

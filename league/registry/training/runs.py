@@ -10,10 +10,10 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import delete, func, select, tuple_
+from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session, undefer
 
-from league.errors import InvalidInput, InvalidReference, UnknownRun
+from league.errors import InvalidReference, UnknownRun
 from league.registry import leagues
 from league.registry.processes import this_process
 from league.registry.storage.database import Repository, as_method, reading, writing
@@ -146,15 +146,8 @@ class RunRepository(Repository):
         before: return only runs that began before this one.
         Raises UnknownLeague, or InvalidInput if `before` is not a run of the league.
         """
-        table = RunRow
-        query = select(table).filter_by(league=league).order_by(table.began_at.desc(), table.id.desc()).limit(limit)
-        leagues.require(session, league)
-        if before is not None:
-            last = session.get(table, (league, before))
-            if last is None:
-                raise InvalidInput(f"before: league {league} has no training run {before!r}")
-            query = query.where(tuple_(table.began_at, table.id) < (last.began_at, last.id))
-        return list(session.scalars(query))
+        key = RunRow.began_at, RunRow.id
+        return leagues.newest(session, league, RunRow, what="training run", key=key, before=before, limit=limit)
 
     @reading
     def stored(self, session: Session, league: str, run: str | None = None) -> list[RunRow]:
