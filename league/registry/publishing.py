@@ -107,21 +107,25 @@ class VersionPublisher(Repository):
         with self._database.read() as session:
             interface_digest = session.get_one(LeagueRow, league).interface_digest
         for member in members:
-            _check_member(member, members[0], interface_digest)
+            _check_base(member, interface_digest)
+            if member.role == EXPLOITER:
+                raise NotPromotable(
+                    f"{member.ref} has the role {EXPLOITER} (of {member.exploits}): it cannot be in a mixture"
+                )
+            if member.manifest.environment_digest != members[0].manifest.environment_digest:
+                raise EnvironmentMismatch(
+                    f"{members[0].ref} and {member.ref} were trained in different environments: they cannot be in one "
+                    "mixture"
+                )
         mixture = Mixture(
             members=tuple(
                 Member(version=member.number, probability=probabilities[member.number], sha256=member.sha256)
                 for member in members
             )
         )
-        first = members[0].manifest
-
-        def build(_: Path, number: int) -> Manifest:
-            steps = max(member.steps for member in members)
-            return _without_policies(first, number, MIXTURE, mixture=mixture, steps=steps)
-
         source = "mixture/" + ",".join(f"{number}:{probability!r}" for number, probability in probabilities.items())
-        return self.publish(league, build, source=source)
+        steps = max(member.steps for member in members)
+        return self._publish_without_policies(members[0].manifest, MIXTURE, source, steps, mixture=mixture)
 
     def publish_search(self, league: str, number: int, rule: SearchRule, simulations: int, ms: float) -> VersionRow:
         """Publish a version that plays version `number` with a search, or return the one that does so already.
@@ -139,11 +143,41 @@ class VersionPublisher(Repository):
         with self._database.read() as session:
             _check_base(base, session.get_one(LeagueRow, league).interface_digest)
         search = SearchSettings(version=number, sha256=base.sha256, rule=rule, simulations=simulations, ms=ms)
+        source = f"search/{number}:{rule}:{simulations}"
+        return self._publish_without_policies(base.manifest, SEARCH, source, base.steps, search=search)
+
+    def _publish_without_policies(
+        self,
+        first: Manifest,
+        role: Role,
+        source: str,
+        steps: int,
+        *,
+        mixture: Mixture | None = None,
+        search: SearchSettings | None = None,
+    ) -> VersionRow:
+        """Publish a version that others play. first: of one of them."""
 
         def build(_: Path, number: int) -> Manifest:
-            return _without_policies(base.manifest, number, SEARCH, search=search, steps=base.steps)
+            return Manifest(
+                league=first.league,
+                version=number,
+                created_at=datetime.now(UTC),
+                interface=first.interface,
+                policies={},
+                environment=first.environment,
+                environment_digest=first.environment_digest,
+                algorithm=role,
+                settings={},
+                seed=0,
+                steps=steps,
+                role=role,
+                mixture=mixture,
+                search=search,
+                stack={},
+            )
 
-        return self.publish(league, build, source=f"search/{number}:{rule}:{simulations}")
+        return self.publish(first.league, build, source=source)
 
     def sweep(self, league: str) -> None:
         """Remove what publishers that died have left."""
@@ -177,51 +211,12 @@ class VersionPublisher(Repository):
         return numbers
 
 
-def _without_policies(
-    first: Manifest,
-    number: int,
-    role: Role,
-    *,
-    steps: int,
-    mixture: Mixture | None = None,
-    search: SearchSettings | None = None,
-) -> Manifest:
-    """Return the manifest of a version that others play. first: of one of them."""
-    return Manifest(
-        league=first.league,
-        version=number,
-        created_at=datetime.now(UTC),
-        interface=first.interface,
-        policies={},
-        environment=first.environment,
-        environment_digest=first.environment_digest,
-        algorithm=role,
-        settings={},
-        seed=0,
-        steps=steps,
-        role=role,
-        mixture=mixture,
-        search=search,
-        stack={},
-    )
-
-
 def _check_base(version: VersionRow, interface_digest: str) -> None:
     if version.retired_at is not None:
         raise VersionRetired(f"{version.ref} was retired and its files were removed: it cannot play")
     version.require_policies()
     if version.manifest.interface.digest() != interface_digest:
         raise EnvironmentMismatch(f"{version.ref} has other spaces or policies than league {version.league} has now")
-
-
-def _check_member(member: VersionRow, first: VersionRow, interface_digest: str) -> None:
-    _check_base(member, interface_digest)
-    if member.role == EXPLOITER:
-        raise NotPromotable(f"{member.ref} has the role {EXPLOITER} (of {member.exploits}): it cannot be in a mixture")
-    if member.manifest.environment_digest != first.manifest.environment_digest:
-        raise EnvironmentMismatch(
-            f"{first.ref} and {member.ref} were trained in different environments: they cannot be in one mixture"
-        )
 
 
 def reserve(session: Session, league: str, source: str, parent: int | None, above: int) -> int:

@@ -40,7 +40,11 @@ class Registry:
 
     def __init__(self, storage: Storage, database: Database) -> None:
         self.storage, self.database = storage, database
-        self.artifacts = artifact_store(storage)
+        self.artifacts = (
+            ArtifactStore(storage.artifacts)
+            if isinstance(storage.artifacts, Path)
+            else ObjectArtifactStore(storage.artifacts, storage.home / OBJECT_STORE_FILES)
+        )
         self.leagues = LeagueRepository(database)
         self.versions = VersionRepository(database, self.artifacts)
         self.retention = RetentionRepository(database, self.artifacts)
@@ -85,10 +89,3 @@ class Registry:
         PostgreSQL ends, further changes by this thread raise StorageError.
         """
         return exclusive_lock.hold(self.database, self.storage.home, name)
-
-
-def artifact_store(storage: Storage) -> ArtifactStore:
-    """Return the artefact store of a storage: a directory or an object store."""
-    if isinstance(storage.artifacts, Path):
-        return ArtifactStore(storage.artifacts)
-    return ObjectArtifactStore(storage.artifacts, storage.home / OBJECT_STORE_FILES)
