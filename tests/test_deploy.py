@@ -360,12 +360,13 @@ def test_shared_memory_holds_the_object_store_of_ray() -> None:
 
 
 def test_schedulers_run_existing_commands_with_their_exit_codes() -> None:
-    from policy_league.cli.evaluation.nightly import BUSY, FAULTS
+    from policy_league.cli.evaluation.nightly import BUSY
+    from policy_league.cli.main import FAILURE
 
     for job, if_busy in zip(JOBS, ("Ignore", "Count"), strict=True):
         rules = [r for r in job["spec"]["jobTemplate"]["spec"]["podFailurePolicy"]["rules"] if "onExitCodes" in r]
         actions = {tuple(rule["onExitCodes"]["values"]): rule["action"] for rule in rules}
-        assert actions == {(FAULTS, 2): "FailJob", (BUSY,): if_busy}
+        assert actions == {(FAILURE, 2): "FailJob", (BUSY,): if_busy}
     crontab = (ROOT / "deploy/nightly/crontab").read_text()
     for unit, command in ("league-nightly", NIGHTLY), ("league-training-night", TRAINING_NIGHT):
         service, timer = ((ROOT / f"deploy/nightly/{unit}.{kind}").read_text() for kind in ("service", "timer"))

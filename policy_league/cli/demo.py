@@ -104,12 +104,8 @@ def _play(config: "LeagueConfig", url: str) -> None:
     say(f"\n{board}\n\nMoves: {played}\n{end}")
 
 
-def drawing(planes: "NDArray") -> str | None:
-    """Draw a board from its planes (rows, columns, 2), ● in the first and ○ in the second; None for other shapes."""
-    import numpy as np
-
-    if planes.ndim != 3 or planes.shape[2] != 2 or not np.isin(planes, (0, 1)).all():
-        return None
+def drawing(planes: "NDArray") -> str:
+    """Draw a board from its planes (rows, columns, 2), ● in the first and ○ in the second."""
     rows = [" ".join(_mark(square) for square in row) for row in planes]
     columns = " ".join(str(column) for column in range(planes.shape[1]))
     return "\n".join([*rows, columns])

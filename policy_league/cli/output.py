@@ -69,14 +69,24 @@ def complain(sentence: str) -> None:
     errors.print(CONTROL.sub("�", sentence), markup=False, soft_wrap=True)
 
 
-def confirm(question: str, hint: str, *, yes: bool, as_json: bool = False) -> None:
+def confirm(
+    question: str,
+    *,
+    yes: bool,
+    as_json: bool = False,
+    hint: str = "without a terminal, confirm with --yes, or use --dry-run",
+    reason: str | None = None,
+) -> None:
     """Ask for confirmation, unless --yes gave it. Ends the command if it is refused.
 
-    Raises InvalidInput with `hint` without a terminal, or with --json.
+    reason: why it is asked, in a sentence before the question. Raises InvalidInput with `hint` without a terminal, or
+    with --json.
     """
     if not yes:
         if as_json or not sys.stdin.isatty():
             raise InvalidInput(hint)
+        if reason:
+            say(reason)
         typer.confirm(question, abort=True)
 
 
@@ -89,6 +99,7 @@ def warn_of_changed_game(registry: "Registry", league: str) -> None:
         )
 
 
+MEGABYTE = 10**6
 GAP = 2
 """Spaces between the columns of a table."""
 NARROWEST_PROSE = 16

@@ -1,8 +1,7 @@
 """`league evaluate`."""
 
 from collections.abc import Sequence
-from enum import Enum
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -24,59 +23,42 @@ if TYPE_CHECKING:
     from league.registry.registry import Registry
 
 
-class ScheduleName(Enum):
-    """Schedules of `league evaluate`."""
-
-    round_robin = "round_robin"
-    gauntlet = "gauntlet"
-    adaptive = "adaptive"
-    cross_play = "cross_play"
-
-
-Refs = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="[REF]…", help="Contestants, such as connect_four@3. Default: all versions."),
-]
-Schedule = Annotated[
-    ScheduleName,
-    typer.Option(
-        help="round_robin: all pairs of contestants. gauntlet: each REF against the contestants of --against. "
-        "adaptive: the matches that reduce rating uncertainty most, a quarter of the games of a round robin. "
-        "cross_play: REFs mixed within one team."
-    ),
-]
-Against = Annotated[
-    list[str] | None,
-    typer.Option(metavar="REF", help="Opponent in a gauntlet; can be repeated. Default: champion and scripts."),
-]
-Blocks = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Matches per pair. A match is two games with the same seed and swapped sides. Adaptive: a quarter of "
-        "this number on average. Default: 32, or unlimited with --games, --minutes or --precision.",
-    ),
-]
-Games = Annotated[int | None, typer.Option(min=2, help="Stop after this number of games.")]
-Minutes = Annotated[float | None, typer.Option(help="Stop after this time.")]
-Precision = Annotated[
-    float | None, typer.Option(metavar="ELO", help="Stop when the 95 % interval of each rating is within ± ELO.")
-]
-Seed = Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Random seed. Another seed plays different games.")]
-
-
 def evaluate(
     league: Annotated[
         str, typer.Argument(metavar="LEAGUE|CONFIG", help="Name of the league, or YAML file, which is registered.")
     ],
-    refs: Refs = None,
-    schedule: Schedule = ScheduleName.round_robin,
-    against: Against = None,
-    blocks: Blocks = None,
-    games: Games = None,
-    minutes: Minutes = None,
-    precision: Precision = None,
-    seed: Seed = 0,
+    refs: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[REF]…", help="Contestants, such as connect_four@3. Default: all versions."),
+    ] = None,
+    schedule: Annotated[
+        Literal["round_robin", "gauntlet", "adaptive", "cross_play"],
+        typer.Option(
+            help="round_robin: all pairs of contestants. gauntlet: each REF against the contestants of --against. "
+            "adaptive: the matches that reduce rating uncertainty most, a quarter of the games of a round robin. "
+            "cross_play: REFs mixed within one team."
+        ),
+    ] = "round_robin",
+    against: Annotated[
+        list[str] | None,
+        typer.Option(metavar="REF", help="Opponent in a gauntlet; can be repeated. Default: champion and scripts."),
+    ] = None,
+    blocks: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Matches per pair. A match is two games with the same seed and swapped sides. Adaptive: a quarter of "
+            "this number on average. Default: 32, or unlimited with --games, --minutes or --precision.",
+        ),
+    ] = None,
+    games: Annotated[int | None, typer.Option(min=2, help="Stop after this number of games.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Stop after this time.")] = None,
+    precision: Annotated[
+        float | None, typer.Option(metavar="ELO", help="Stop when the 95 % interval of each rating is within ± ELO.")
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, max=MAX_SEED, help="Random seed. Another seed plays different games.")
+    ] = 0,
     workers: ClusterWorkers = None,
     address: EvaluationCluster = None,
     as_json: AsJson = False,
@@ -100,7 +82,7 @@ def evaluate(
             LeagueConfig.load(find(league)) if is_file else check_slug("league", league),
             refs or (),
             registry=registry,
-            schedule=schedule.value,
+            schedule=schedule,
             against=against or (),
             blocks=blocks,
             budget=Budget(games, minutes, precision),
@@ -142,8 +124,11 @@ def _show(report: "EvaluationReport", registry: "Registry") -> None:
         complain(f"{ref} forfeited {lost}")
     if report.population is not None:
         say("\nα-Rank and Nash equilibrium shares [95 %]:")
-        shares = map(_share, report.population.alpha_rank), map(_share, report.population.nash)
-        table(("contestant", "α-Rank", "Nash"), zip(payoff.contestants, *shares, strict=True))
+        population = zip(payoff.contestants, report.population.alpha_rank, report.population.nash, strict=True)
+        table(
+            ("contestant", "α-Rank", "Nash"),
+            [(ref, _span(rank, ".3f"), _span(share, ".3f")) for ref, rank, share in population],
+        )
 
 
 def _show_matrix(contestants: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
@@ -151,15 +136,10 @@ def _show_matrix(contestants: Sequence[str], cells: Sequence[Sequence[Any]]) -> 
     table(("", *names), [(name, *row) for name, row in zip(names, cells, strict=True)])
 
 
-def _share(estimate: "Estimate") -> str:
-    """`0.250 [0.100, 0.400]`"""
-    bounds = "" if estimate.low is None or estimate.high is None else f" [{estimate.low:.3f}, {estimate.high:.3f}]"
-    return f"{estimate.value:.3f}{bounds}"
-
-
-def _span(estimate: "Estimate | None") -> str | None:
+def _span(estimate: "Estimate | None", form: str = ".4g") -> str | None:
     """`-21.5 [-22.1, -20.9]`"""
     if estimate is None:
         return None
-    bounds = "" if estimate.low is None or estimate.high is None else f" [{estimate.low:.4g}, {estimate.high:.4g}]"
-    return f"{estimate.value:.4g}{bounds}"
+    low, high = estimate.low, estimate.high
+    bounds = "" if low is None or high is None else f" [{low:{form}}, {high:{form}}]"
+    return f"{estimate.value:{form}}{bounds}"

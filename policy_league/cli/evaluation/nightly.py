@@ -21,6 +21,7 @@ from league.refs import check_slug
 from league.settings import Storage
 from policy_league.cli.evaluation.report import write_report
 from policy_league.cli.interrupt import exit_on_interrupt
+from policy_league.cli.main import FAILURE, USAGE_ERROR
 from policy_league.cli.options import CORES, AsJson, ClusterWorkers, EvaluationCluster, open_registry, workers_for
 from policy_league.cli.output import GameProgress, complain, console, emit, say, show_leaderboard
 from policy_league.configs.bundled import find, names
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from league.registry.registry import Registry
     from league.registry.storage.rows import TrainingNightRow
 
-FAULTS = 1
-INVALID = 2
 BUSY = 75
 """EX_TEMPFAIL of sysexits.h: try again later."""
 
@@ -114,7 +113,7 @@ class _Outcome:
 
     @property
     def exit_code(self) -> int:
-        return FAULTS if self.faults else INVALID if self.invalid else BUSY if self.busy else 0
+        return FAILURE if self.faults else USAGE_ERROR if self.invalid else BUSY if self.busy else 0
 
     def fail(self, league: str | None, error: LeagueError) -> None:
         """Print and record why a league's run ended early. An archived league is not an error.

@@ -8,12 +8,10 @@ import typer
 
 from league.refs import CheckpointRef, check_slug
 from policy_league.cli.options import AsJson, open_registry
-from policy_league.cli.output import confirm, counted, emit, say
+from policy_league.cli.output import MEGABYTE, confirm, counted, emit, say
 
 if TYPE_CHECKING:
     from league.registry.deletion.removal import RemovalPlan
-
-MEGABYTE = 10**6
 
 
 def remove(
@@ -43,8 +41,7 @@ def remove(
             say(sentence)
     if not dry_run:
         if force or not plan.reasons:
-            hint = "without a terminal, confirm with --yes, or use --dry-run"
-            confirm(f"Remove {plan.target}? This cannot be undone.", hint, yes=yes)
+            confirm(f"Remove {plan.target}? This cannot be undone.", yes=yes)
         with registry.exclusive_lock(f"nightly-{league}"):
             if ref is not None:
                 plan = removal.remove_version(CheckpointRef.parse(plan.target), force=force)

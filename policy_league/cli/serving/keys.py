@@ -26,12 +26,10 @@ app = typer.Typer(
 DURATIONS = {"m": timedelta(minutes=1), "h": timedelta(hours=1), "d": timedelta(days=1), "w": timedelta(weeks=1)}
 PERIODS = {"s": 1, "m": 60, "h": 3600}
 
-KeyName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the key, recorded in histories as the actor.")]
-
 
 @app.command()
 def create(
-    name: KeyName,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the key, recorded in histories as the actor.")],
     scopes: Annotated[
         list[str], typer.Option("--scope", help="Permission: act, read, evaluate or promote. Can be repeated.")
     ],

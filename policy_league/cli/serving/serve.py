@@ -51,7 +51,6 @@ def serve(
     from serve_app.runtime.launch import serve_forever
 
     storage = Storage.from_environment()
-    storage.export()
     say("Starting Ray Serve …")
     serve_forever(
         storage,

@@ -19,30 +19,24 @@ CANARY_SHARE, SHADOW_SHARE = 0.05, 1.0
 NONE = "none"
 
 
-Canary = Annotated[
-    str | None,
-    typer.Option(metavar="REF", help="Version that serves a share of the champion's requests; `none` removes it."),
-]
-CanaryShare = Annotated[
-    float | None,
-    typer.Option(min=0, max=1, help=f"Share of routing keys that the canary serves. Default: {CANARY_SHARE}."),
-]
-ShadowRef = Annotated[
-    str | None,
-    typer.Option(metavar="REF", help="Version that receives copies of requests for comparison; `none` removes it."),
-]
-ShadowShare = Annotated[
-    float | None,
-    typer.Option(min=0, max=1, help=f"Share of requests copied to the shadow. Default: {SHADOW_SHARE:g}."),
-]
-
-
 def traffic(
     league: LeagueName,
-    canary: Canary = None,
-    share: CanaryShare = None,
-    shadow: ShadowRef = None,
-    shadow_share: ShadowShare = None,
+    canary: Annotated[
+        str | None,
+        typer.Option(metavar="REF", help="Version that serves a share of the champion's requests; `none` removes it."),
+    ] = None,
+    share: Annotated[
+        float | None,
+        typer.Option(min=0, max=1, help=f"Share of routing keys that the canary serves. Default: {CANARY_SHARE}."),
+    ] = None,
+    shadow: Annotated[
+        str | None,
+        typer.Option(metavar="REF", help="Version that receives copies of requests for comparison; `none` removes it."),
+    ] = None,
+    shadow_share: Annotated[
+        float | None,
+        typer.Option(min=0, max=1, help=f"Share of requests copied to the shadow. Default: {SHADOW_SHARE:g}."),
+    ] = None,
     off: Annotated[bool, typer.Option("--off", help="Remove both.")] = False,
     reason: Reason = "set by hand",
     actor: Actor = None,

@@ -25,42 +25,34 @@ if TYPE_CHECKING:
 TOKENS = {"RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"}
 
 
-Parent = Annotated[
-    str | None,
-    typer.Option("--from", metavar="REF", help="Continue from this version, such as connect_four@3 or @champion."),
-]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Resume an interrupted run, or a completed one with a larger budget.")
-]
-Job = Annotated[
-    bool, typer.Option("--job", help="Submit a Ray job. --address is the cluster's dashboard, http://HOST:8265.")
-]
-
-
-RoleName = Annotated[
-    Literal["main", "exploiter"], typer.Option("--role", help="`exploiter`: a run against one version only.")
-]
-Like = Annotated[
-    str | None,
-    typer.Option(metavar="REF", help="Use as many runners, environments, threads and GPUs as this version's run."),
-]
-Against = Annotated[
-    str | None,
-    typer.Option(metavar="REF", help="The opponent of an exploiter in all episodes, such as connect_four@champion."),
-]
-
-
 @with_training_options
 def train(
     config: Config,
     *,
     options: TrainingOptions,
-    parent: Parent = None,
-    role: RoleName = "main",
-    against: Against = None,
-    like: Like = None,
-    resume: Resume = False,
-    job: Job = False,
+    parent: Annotated[
+        str | None,
+        typer.Option("--from", metavar="REF", help="Continue from this version, such as connect_four@3 or @champion."),
+    ] = None,
+    role: Annotated[
+        Literal["main", "exploiter"], typer.Option("--role", help="`exploiter`: a run against one version only.")
+    ] = "main",
+    against: Annotated[
+        str | None,
+        typer.Option(
+            metavar="REF", help="The opponent of an exploiter in all episodes, such as connect_four@champion."
+        ),
+    ] = None,
+    like: Annotated[
+        str | None,
+        typer.Option(metavar="REF", help="Use as many runners, environments, threads and GPUs as this version's run."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Resume an interrupted run, or a completed one with a larger budget.")
+    ] = False,
+    job: Annotated[
+        bool, typer.Option("--job", help="Submit a Ray job. --address is the cluster's dashboard, http://HOST:8265.")
+    ] = False,
 ) -> None:
     """Train a league's policies and publish versions.
 

@@ -1,6 +1,5 @@
 """`league promote`, `mixture`, `rollback` and `history`."""
 
-import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated
@@ -68,8 +67,13 @@ def promote(
     current = registry.aliases.current(version.league).get(alias)
     before = current if expectation is None else expectation[0]
     if alias == CHAMPION and not yes and version.number != current:
+        from evaluation.reporting.gate_record import doubts
+
         registry.aliases.check(version.league, alias, version.number, expected=before)
-        _confirm(registry, version, as_json)
+        if (evidence := doubts(registry, version)) is not None:
+            hint = f"{evidence}; confirm with --yes that {version.ref} shall be champion"
+            question = f"Make {version.ref} the champion?"
+            confirm(question, yes=False, as_json=as_json, hint=hint, reason=f"{evidence}.")
     event = registry.aliases.set(
         version.league,
         alias,
@@ -79,21 +83,6 @@ def promote(
         reason=reason,
     )
     _moved(event, current, as_json, registry.changes.wait_for_alias(event, timeout) if wait else None)
-
-
-def _confirm(registry: "Registry", version: "VersionRow", as_json: bool) -> None:
-    """Ask before a version becomes champion that the gate has rejected, or that has not played.
-
-    Raises InvalidInput without a terminal.
-    """
-    from evaluation.reporting.gate_record import doubts
-
-    if (evidence := doubts(registry, version)) is None:
-        return
-    if as_json or not sys.stdin.isatty():
-        raise InvalidInput(f"{evidence}; confirm with --yes that {version.ref} shall be champion")
-    say(f"{evidence}.")
-    typer.confirm(f"Make {version.ref} the champion?", abort=True)
 
 
 def _mixture(registry: "Registry", text: str) -> "VersionRow":
@@ -159,7 +148,7 @@ def mixture(
             emit({"league": league, "method": method} | figures | {"members": shares})
         return
     hint = "without a terminal, confirm with --yes, or omit --alias to show the mixture only"
-    confirm(f"Point {league}@{alias} to it?", hint, yes=yes, as_json=as_json)
+    confirm(f"Point {league}@{alias} to it?", yes=yes, as_json=as_json, hint=hint)
     ref = next(iter(shares)) if len(shares) == 1 else ",".join(f"{ref}:{share!r}" for ref, share in shares.items())
     promote(ref, alias=alias, yes=True, reason=reason, actor=actor, wait=wait, timeout=timeout, as_json=as_json)
 

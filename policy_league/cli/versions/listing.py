@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 SHOWN = 20
 """Number of versions in a table."""
 
-Ref = Annotated[str, typer.Argument(metavar="REF", help="Version, such as connect_four@3.")]
-
 
 def versions(
     league: LeagueName,
@@ -116,7 +114,7 @@ def _document(row: "VersionRow", standing: dict[str, Any]) -> dict[str, Any]:
 
 
 def note(
-    ref: Ref,
+    ref: Annotated[str, typer.Argument(metavar="REF", help="Version, such as connect_four@3.")],
     text: Annotated[str, typer.Argument(metavar="TEXT", help="New text; an empty string clears the note.")],
     actor: Actor = None,
 ) -> None:

@@ -8,12 +8,10 @@ import typer
 
 from league.refs import check_slug
 from policy_league.cli.options import AsJson, open_registry
-from policy_league.cli.output import confirm, emit, say, table
+from policy_league.cli.output import MEGABYTE, confirm, emit, say, table
 
 if TYPE_CHECKING:
     from league.registry.deletion.retention import Removal
-
-MEGABYTE = 10**6
 
 
 def retire(
@@ -45,8 +43,7 @@ def retire(
     is_empty = not old_logs and not any(plan.versions or plan.training for plan in plans)
     if not dry_run and not is_empty:
         size = sum(plan.size for plan in plans) + sum(path.stat().st_size for path in old_logs)
-        hint = "without a terminal, confirm with --yes, or use --dry-run"
-        confirm(f"Remove {size / MEGABYTE:,.0f} MB?", hint, yes=yes)
+        confirm(f"Remove {size / MEGABYTE:,.0f} MB?", yes=yes)
         plans = [registry.retention.retire(name, keep=keep, before=before) for name in names]
         for path in old_logs:
             path.unlink(missing_ok=True)
