@@ -95,12 +95,6 @@ class TrafficRepository(Repository):
         return {event.league: _row(event) for event in events}
 
     @reading
-    def history(self, session: Session, league: str) -> list[Traffic]:
-        """Return all settings of a league, newest first. Raises UnknownLeague."""
-        query = select(TrafficEventTable).filter_by(league=league).order_by(TrafficEventTable.id.desc())
-        return [_row(event) for event in leagues.rows(session, league, query)]
-
-    @reading
     def shadow_counts(self, session: Session, league: str) -> list[ShadowCounts]:
         """Return the shadow counters of a league, summed over replicas, by candidate and champion."""
         table = ShadowCounts

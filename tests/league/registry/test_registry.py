@@ -31,7 +31,7 @@ from league.results.ledger import Ledger
 from tests.support.databases import on_both_databases
 from tests.support.examples import examples
 from tests.support.leagues.ledger_matches import SCHEDULE
-from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered
+from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered, traffic_history
 
 pytestmark = on_both_databases
 
@@ -300,7 +300,7 @@ class Changes(RuleBasedStateMachine):
             recorded = [(event.alias, event.kind, event.version, event.previous) for event in history]
             assert recorded == [event for event in self.model.events if event[0] == alias]
             assert all(earlier.at <= later.at for earlier, later in pairwise(history))
-        history_of_traffic = self.registry.traffic.history(LEAGUE)[::-1]
+        history_of_traffic = traffic_history(self.registry)[::-1]
         assert [{"canary": row.canary, "shadow": row.shadow} for row in history_of_traffic] == self.model.settings
         current = self.registry.traffic.current(LEAGUE)
         assert {"canary": current.canary, "shadow": current.shadow} == self.model.traffic

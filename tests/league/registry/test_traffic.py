@@ -15,7 +15,7 @@ from league.registry.storage.rows import Portion, ShadowCounts, Traffic
 from league.registry.storage.tables import ReplicaReportTable
 from tests.support.databases import on_both_databases
 from tests.support.leagues.acknowledgements import acknowledge
-from tests.support.leagues.registries import LEAGUE, registered
+from tests.support.leagues.registries import LEAGUE, registered, traffic_history
 
 EMPTY = (0,) * (len(BOUNDS) + 1)
 
@@ -39,7 +39,7 @@ def test_only_existing_versions_get_traffic(versioned: Registry) -> None:
     ):
         with pytest.raises(error):
             set_traffic(versioned, canary=portion)
-    assert versioned.traffic.history(LEAGUE) == []
+    assert traffic_history(versioned) == []
 
 
 def shadow_counts(candidate: int = 2, requests: int = 10, **counts: int) -> ShadowCounts:
@@ -98,7 +98,7 @@ def test_a_setting_has_its_actor_and_reason(versioned: Registry) -> None:
     both = set_traffic(versioned, shadow=Portion("candidate", 1.0))
     assert (both.canary, both.shadow) == (Portion(2, 0.05), Portion("candidate", 1.0)), "what is not named remains"
     assert set_traffic(versioned, canary=None).shadow == both.shadow
-    assert [(row.canary, row.shadow) for row in versioned.traffic.history(LEAGUE)][::2] == [
+    assert [(row.canary, row.shadow) for row in traffic_history(versioned)][::2] == [
         (None, both.shadow),
         (setting.canary, None),
     ]

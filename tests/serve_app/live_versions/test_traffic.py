@@ -41,6 +41,7 @@ from tests.support.clients.actions import (
     version_for,
 )
 from tests.support.clients.streams import answer_to, open_stream
+from tests.support.leagues.registries import traffic_history
 from tests.support.leagues.served_leagues import everything, promote, publish
 from tests.support.policies.graphs import counting, endless_mlp, masked_mlp, memoryless
 from tests.support.servers.exposition import value
@@ -134,7 +135,7 @@ def test_traffic_is_set_over_http(promoter: TestClient, registry: Registry) -> N
     assert change(promoter, TRAFFIC, "b", shadow)["canary"] == response["canary"], "the canary remains"
     both = change(promoter, TRAFFIC, "c", {"canary": None, "shadow": None})
     assert (both["canary"], both["shadow"]) == (None, None)
-    assert [one.canary and one.canary.share for one in registry.traffic.history("board")] == [None, 0.05, 0.05]
+    assert [one.canary and one.canary.share for one in traffic_history(registry, "board")] == [None, 0.05, 0.05]
     until(lambda: promoter.get(TRAFFIC).json()["replicas"][0]["follows"])
 
 

@@ -9,10 +9,12 @@ from sqlalchemy import update
 
 from league.config.league import LeagueConfig
 from league.interface import AgentInterface, Interface
+from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
-from league.registry.storage.manifest import Manifest, Parity, PolicyManifest, Tensor
-from league.registry.storage.rows import EvaluationRow, RunRow, VersionRow
+from league.registry.storage.manifest import TRAINING, Manifest, Parity, PolicyManifest, Tensor
+from league.registry.storage.rows import EvaluationRow, RunRow, Traffic, VersionRow
+from league.registry.traffic import setting_at
 from league.spaces import Box, DictSpace, Discrete
 
 LEAGUE = "tictactoe"
@@ -115,3 +117,23 @@ def leftovers(registry: Registry, league: str = LEAGUE) -> list[str]:
     directory = registry.artifacts.root / league
     ready = {str(version.number) for version in registry.versions.all(league)}
     return sorted(p.name for p in directory.iterdir() if p.name not in ready) if directory.exists() else []
+
+
+def traffic_history(registry: Registry, league: str = LEAGUE) -> list[Traffic]:
+    """All traffic settings of a league, newest first."""
+    with registry.database.read() as session:
+        settings, before = [], setting_at(session, league)
+        while before is not None:
+            settings.append(before)
+            before = setting_at(session, league, (before.id or 0) - 1)
+        return settings
+
+
+def verified(registry: Registry, number: int, league: str = LEAGUE) -> Manifest:
+    """The manifest of a version, after reading and verifying all files that it has."""
+    version = registry.versions.with_files(CheckpointRef(league, number))
+    manifest = registry.artifacts.verify_names(league, number, version.sha256)
+    for name in manifest.files:
+        if registry.versions.has_training(version) or not name.startswith(TRAINING):
+            registry.artifacts.read(manifest, name)
+    return manifest

@@ -24,7 +24,7 @@ from league.results.ledger import Ledger
 from league.settings import Storage
 from tests.support.databases import on_both_databases
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
-from tests.support.leagues.registries import LEAGUE, interface, publish
+from tests.support.leagues.registries import LEAGUE, interface, publish, traffic_history
 
 pytestmark = on_both_databases
 
@@ -129,7 +129,7 @@ def test_what_version_0_1_0_wrote_is_read(storage: Storage) -> None:
         )
         (key,) = registry.keys.all()
         assert (key.name, key.scopes, key.leagues, key.rate) == ("ci", {"read", "promote"}, {LEAGUE}, 20)
-        (setting,) = registry.traffic.history(LEAGUE)
+        (setting,) = traffic_history(registry)
         assert (setting.canary, setting.shadow) == (Portion(2, 0.25), Portion("candidate", 0.5))
         (counts,) = registry.traffic.shadow_counts(LEAGUE)
         assert (counts.agreement, counts.latency[:3]) == (0.75, [1, 2, 3])
