@@ -76,16 +76,13 @@ class LeagueConfig(Part):
     @field_validator("training")
     @classmethod
     def _fits_the_algorithm(cls, value: TrainingConfig) -> TrainingConfig:
-        return typed(value)
-
-    @field_validator("training")
-    @classmethod
-    def _exploiters_can_be_trained(cls, value: TrainingConfig) -> TrainingConfig:
+        """Return the settings as those of their algorithm, which those of exploiters fit, too."""
+        training = typed(value)
         try:
-            type(value).model_validate(settings := value.model_dump(by_alias=True) | value.exploiter)
+            type(training).model_validate(settings := training.model_dump(by_alias=True) | training.exploiter)
         except ValidationError as error:
             raise ValueError(f"exploiter.{describe_validation_error(error, settings)}") from error
-        return value
+        return training
 
     @model_validator(mode="after")
     def _simulators_have_no_arguments(self) -> Self:
