@@ -8,7 +8,6 @@ loads of the same version from a directory.
 
 import os
 import random
-import shutil
 import socket
 import subprocess
 import sys
@@ -24,10 +23,12 @@ from benchmarks.footprint import LARGE
 from benchmarks.harness import Quick, Target
 from benchmarks.leagues.served_league import LEAGUE, builder, fill
 from league.registry.registry import Registry
+from league.registry.storage.exports import exported_files, write_files
 from league.registry.storage.manifest import Manifest
 from league.settings import Storage
 from serve_app.live_versions.policies import ActionSelections
 from serve_app.live_versions.version_cache import load
+from tests.support.leagues.registries import verified
 from tests.support.servers import object_store
 
 KILLS, LATEST_KILL = 100, 0.04
@@ -87,7 +88,7 @@ def _kills(home: Path, url: str, times: int) -> Target:
 
 def _is_complete(registry: Registry, number: int) -> bool:
     try:
-        registry.versions.fetch(LEAGUE, number)
+        verified(registry, number, LEAGUE)
     except Exception as error:
         print(error)
         return False
@@ -96,7 +97,7 @@ def _is_complete(registry: Registry, number: int) -> bool:
 
 def _prepared(registry: Registry, target: Path) -> Path:
     """The files of version 1, with a training state of 2 MB."""
-    shutil.copytree(registry.versions.fetch(LEAGUE, 1), target)
+    write_files(exported_files(registry.versions.get(LEAGUE, 1), registry.artifacts), target)
     (target / "training").mkdir()
     (target / "training" / "state").write_bytes(os.urandom(2 * 10**6))
     return target

@@ -9,7 +9,6 @@ GPU where the part uses one: otherwise, and with `--quick`, values are only repo
 import json
 import math
 import os
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -93,7 +92,7 @@ def run(job: Job) -> Trained:
         for number, version in enumerate(train(league, registry=registry, local=LocalRay(len(job.cores))), 1):
             (policy,) = version.manifest.policies.values()
             graphs[f"{job.minutes * number / job.versions:.2f}"] = file = f"{job.name}-{number}.onnx".replace(" ", "_")
-            shutil.copy(registry.versions.fetch(version.league, version.number) / policy.file, job.folder / file)
+            (job.folder / file).write_bytes(registry.artifacts.read(version.manifest, policy.file))
         (record,) = registry.runs.newest(league.league)
         points = registry.runs.points(league.league, record.id)
         first, last = points[len(points) // 8], points[-1]

@@ -132,10 +132,6 @@ class VersionRepository(Repository):
         states = {(league, number): VersionState(*state) for league, number, *state in self._database.rows(query)}
         return {key: states.get(key) for key in keys}
 
-    def fetch(self, league: str, number: int) -> Path:
-        """Return a local directory with the verified files of a version. Raises ArtifactCorrupt or VersionRetired."""
-        return self._artifacts.verify(league, number, self.with_files(CheckpointRef(league, number)).sha256)
-
     def copy(self, league: str, number: int, folder: str, target: Path) -> Path:
         """Copy a folder of a version to the new directory `target`, and return it.
 

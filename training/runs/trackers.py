@@ -12,7 +12,6 @@ import logging
 import os
 import queue
 import re
-import shutil
 import tempfile
 import threading
 import time
@@ -26,7 +25,7 @@ from league.config.training import TrackerName
 from league.entry_points import import_entry_point
 from league.errors import ConfigError, no_exit, one_line
 from league.registry.registry import Registry
-from league.registry.storage.manifest import TRAINING
+from league.registry.storage.exports import exported_files, write_files
 from league.registry.storage.rows import RunState, StrengthRow, VersionRow
 from training.runs.run_directory import RunDirectory
 from training.runs.run_reporter import ending, is_metric, tag
@@ -96,8 +95,8 @@ class Trackers:
 
         def add(tracker: Tracker) -> None:
             with tempfile.TemporaryDirectory(prefix="league-tracker-") as directory:
-                source, files = self._registry.versions.fetch(version.league, version.number), Path(directory) / "files"
-                shutil.copytree(source, files, ignore=shutil.ignore_patterns(TRAINING))
+                files = Path(directory) / "files"
+                write_files(exported_files(version, self._registry.artifacts), files)
                 tracker.add(version.ref, files, about)
 
         for reports in self._queues:

@@ -15,7 +15,6 @@ from league.files import (
     copy_verified,
     digests_of,
     disk_errors,
-    file_sha256,
     files_in,
     flush,
     move_durably,
@@ -111,16 +110,6 @@ class ArtifactStore:
         """Return whether a version has files in a folder."""
         return (self.path(league, number) / folder).is_dir()
 
-    def verify(self, league: str, number: int, sha256: str) -> Path:
-        """Return the directory of a version after verifying all its files. Raises ArtifactCorrupt."""
-        directory, manifest = self.path(league, number), self.verify_names(league, number, sha256)
-        with disk_errors(directory):
-            for name in self._expected(manifest):
-                path, digest = directory / name, manifest.files[name]
-                # Reading a pipe or a device, which a link may point to, would not end.
-                check_digest(label(league, number, name), digest, file_sha256(path) if path.is_file() else None)
-        return directory
-
     def verify_names(self, league: str, number: int, sha256: str) -> Manifest:
         """Return the manifest of a version after verifying that exactly the files that it names exist.
 
@@ -130,10 +119,12 @@ class ArtifactStore:
         directory, manifest = self.path(league, number), self.manifest(league, number, sha256)
         with disk_errors(directory):
             present = set(files_in(directory)) - {MANIFEST}
+            has_training = self.has_folder(league, number, TRAINING)
         for name in sorted(present - set(manifest.files)):
             raise ArtifactCorrupt(f"{label(league, number, name)} does not belong to {league}@{number}")
-        for name in sorted(self._expected(manifest) - present):
-            check_digest(label(league, number, name), manifest.files[name], None)
+        for name in sorted(set(manifest.files) - present):
+            if has_training or not name.startswith(f"{TRAINING}/"):
+                check_digest(label(league, number, name), manifest.files[name], None)
         return manifest
 
     def manifest(self, league: str, number: int, sha256: str) -> Manifest:
@@ -161,11 +152,6 @@ class ArtifactStore:
         }
         source = self.path(manifest.league, manifest.version) / folder
         copy_verified(source, names, target, label(manifest.league, manifest.version, folder))
-
-    def _expected(self, manifest: Manifest) -> set[str]:
-        """Return the names of all files that must exist."""
-        has_training = (self.path(manifest.league, manifest.version) / TRAINING).exists()
-        return {name for name in manifest.files if has_training or not name.startswith(f"{TRAINING}/")}
 
     def _verified(self, league: str, number: int, name: str, digest: str) -> bytes:
         content = self._content(league, number, name, digest)

@@ -162,19 +162,6 @@ class ObjectArtifactStore(ArtifactStore):
         names = [name for name, _ in self._objects(f"{key}/{folder}")]
         return f"{key}/{REMOVED}" not in names and any(name.startswith(f"{key}/{folder}/") for name in names)
 
-    def verify(self, league: str, number: int, sha256: str) -> Path:
-        """Download all files of a version to a local directory and return it. Raises ArtifactCorrupt."""
-        manifest, target = self.manifest(league, number, sha256), self.path(league, number)
-        has_training = self.has_folder(league, number, TRAINING)
-        with disk_errors(target):
-            shutil.rmtree(target, ignore_errors=True)
-            target.mkdir(parents=True, mode=0o700)
-            (target / MANIFEST).write_text(manifest.to_json(), encoding="utf-8")
-        for name in manifest.files:
-            if has_training or not name.startswith(f"{TRAINING}/"):
-                self._download(manifest, name, target / name)
-        return target
-
     def verify_names(self, league: str, number: int, sha256: str) -> Manifest:
         """Return the manifest of a version. A missing file is reported when it is read. Raises ArtifactCorrupt."""
         return self.manifest(league, number, sha256)

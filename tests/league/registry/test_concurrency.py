@@ -11,7 +11,7 @@ from league.errors import AliasMoved
 from league.registry.registry import Registry
 from league.settings import Storage
 from tests.support.databases import on_both_databases
-from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered
+from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered, verified
 
 pytestmark = on_both_databases
 
@@ -81,7 +81,7 @@ def test_publishers_share_no_number_and_publish_each_checkpoint_once(
     assert published == dict(zip(chain(*numbers), chain(*sources), strict=True))
     assert sorted(published) == list(range(1, 6 * PROCESSES + 1))
     for number in published:
-        registry.versions.fetch(LEAGUE, number)
+        verified(registry, number)
     same = [f"run/{i}" for i in range(6)]
     numbers = list(processes.map(_publish, [storage] * PROCESSES, [same] * PROCESSES))
     assert numbers == [numbers[0]] * PROCESSES

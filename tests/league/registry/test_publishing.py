@@ -23,7 +23,7 @@ from league.registry.registry import Registry
 from league.registry.storage.manifest import Manifest
 from league.registry.storage.tables import VersionTable
 from league.settings import Storage
-from tests.support.leagues.registries import GRAPH, LEAGUE, builder, leftovers, manifest, publish
+from tests.support.leagues.registries import GRAPH, LEAGUE, builder, leftovers, manifest, publish, verified
 
 
 def rows(registry: Registry) -> list[int]:
@@ -34,7 +34,7 @@ def rows(registry: Registry) -> list[int]:
 
 def test_a_version_has_number_manifest_and_digest(registry: Registry) -> None:
     version = publish(registry, "run/1")
-    directory = registry.versions.fetch(LEAGUE, 1)
+    directory = registry.artifacts.path(LEAGUE, 1)
     assert (version.ref, version.parent, version.steps, version.aliases) == ("tictactoe@1", None, 1000, ())
     assert version.sha256 == hashlib.sha256((directory / "manifest.json").read_bytes()).hexdigest()
     assert version.manifest == Manifest.from_json((directory / "manifest.json").read_bytes(), "manifest.json")
@@ -145,7 +145,7 @@ def test_a_commit_with_a_lost_response_keeps_the_version(registry: Registry, mon
         publish(registry, "run/1")
     monkeypatch.undo()
     assert registry.database is database
-    assert registry.versions.fetch(LEAGUE, 1).name == "1"
+    assert verified(registry, 1).version == 1
     assert publish(registry, "run/1").number == 1
 
 

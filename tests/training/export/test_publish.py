@@ -72,7 +72,7 @@ def test_a_version_has_a_complete_manifest_and_acts_like_its_checkpoint(registry
     assert manifest.settings["lambda"] == LEAGUE.training.lambda_
     assert manifest.stack == installed()
     assert manifest.policies["shared"].parity.observations >= 2000
-    artefact = registry.versions.fetch("tictactoe", number)
+    artefact = registry.artifacts.path("tictactoe", number)
     probes = Probes.from_bytes((artefact / "shared.probes.npz").read_bytes(), "probes")
     assert len(probes) == 32
     assert len({board.tobytes() for board in probes.observations["observation"]}) > 16
@@ -108,9 +108,7 @@ def test_a_recurrent_policy_is_exported_with_its_state(tmp_path: Path, monkeypat
         )
         assert [tensor.name for tensor in row.manifest.policies["shared"].state] == ["state_in_0", "state_in_1"]
         assert row.manifest.policies["shared"].value is None
-        probes = Probes.from_bytes(
-            (registry.versions.fetch("remembering", row.number) / "shared.probes.npz").read_bytes(), "probes"
-        )
+        probes = Probes.from_bytes(registry.artifacts.read(row.manifest, "shared.probes.npz"), "probes")
         assert probes.state["state_in_1"].any(), "no probe is from within an episode"
         policy = load(row.ref, registry=registry)
         batch, state = {"observation": np.array([1, 0])}, None

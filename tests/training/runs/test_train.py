@@ -197,7 +197,7 @@ def test_a_recurrent_team_is_trained_and_continued(registry: Registry) -> None:
     policy = versions[1].manifest.policies["shared"]
     assert [tensor.name for tensor in policy.inputs if tensor not in policy.state] == ["observation"]
     assert [tensor.shape for tensor in policy.state] == [(None, 8), (None, 1)]
-    assert [path.name for path in registry.versions.fetch("two_step_game", 2).glob("*.onnx")] == ["shared.onnx"]
+    assert [path.name for path in registry.artifacts.path("two_step_game", 2).glob("*.onnx")] == ["shared.onnx"]
     (run,) = (registry.storage.home / "runs" / "two_step_game").iterdir()
     assert {"joint/loss", "joint/value", "joint/error"} <= set(curves(run).Tags()["scalars"])
     parent = CheckpointRef("two_step_game", 1)

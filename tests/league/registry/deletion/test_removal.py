@@ -17,7 +17,7 @@ from league.results.ledger import Ledger
 from league.settings import Storage
 from tests.support.crashes import ProcessDeath, crash_after
 from tests.support.leagues.ledger_matches import SCHEDULE, play_match
-from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered
+from tests.support.leagues.registries import LEAGUE, leftovers, publish, registered, verified
 from tests.support.templates import copy_of
 
 OTHER = "another"
@@ -190,7 +190,7 @@ def test_a_league_in_use_is_removed_by_force_only(used: Registry) -> None:
     assert rows_of(used, OTHER) == of_other
     assert not directory.parent.exists()
     assert leftovers_of_removed(used) == []
-    assert used.versions.fetch(OTHER, 1).is_dir()
+    assert verified(used, 1, OTHER)
 
 
 def test_an_interrupted_removal_leaves_an_archived_league_and_can_be_completed(

@@ -17,7 +17,7 @@ from league.results.ledger import Ledger
 from league.results.records import Schedule
 from league.settings import Storage
 from tests.support.leagues.ledger_matches import SCHEDULE
-from tests.support.leagues.registries import LEAGUE, publish, registered
+from tests.support.leagues.registries import LEAGUE, publish, registered, verified
 from tests.support.templates import copy_of
 
 MONTH = timedelta(days=30)
@@ -59,7 +59,7 @@ def test_needed_versions_keep_their_policies(versions: Registry, tmp_path: Path)
     assert retire(versions) == ({5}, {1, 3, 4})
     assert [has_training(versions, number) for number in range(1, 7)] == [False, True, False, False, False, True]
     for number in (1, 2, 3, 4, 6):
-        assert versions.versions.fetch(LEAGUE, number).is_dir()
+        assert verified(versions, number)
     with pytest.raises(VersionRetired, match=f"{LEAGUE}@4 has no training state any more"):
         versions.versions.copy(LEAGUE, 4, TRAINING, tmp_path / "start")
     assert retire(versions) == (set(), set()), "nothing is left to remove"
@@ -110,7 +110,7 @@ def test_a_retired_version_is_listed_but_cannot_be_used(versions: Registry) -> N
     assert all(row.retired_at is None for row in versions.versions.all(LEAGUE))
     assert retire(versions)[0] == set(plan.versions) == {1, 2, 3, 4, 5}
     for use in (
-        lambda: versions.versions.fetch(LEAGUE, 2),
+        lambda: verified(versions, 2),
         lambda: versions.aliases.set(LEAGUE, "champion", 2, expected=None, actor="me", reason=""),
         lambda: versions.traffic.set(LEAGUE, canary=Portion(2, 0.5), actor="me", reason=""),
     ):

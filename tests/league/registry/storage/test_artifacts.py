@@ -11,7 +11,7 @@ import pytest
 from league.errors import ArtifactCorrupt, FilesMissing, UnknownVersion, VersionRetired
 from league.registry.registry import Registry
 from league.registry.storage.manifest import TRAINING
-from tests.support.leagues.registries import GRAPH, LEAGUE, builder, publish
+from tests.support.leagues.registries import GRAPH, LEAGUE, builder, publish, verified
 
 
 def test_the_first_version_of_a_league_survives_a_power_failure(
@@ -26,10 +26,10 @@ def test_the_first_version_of_a_league_survives_a_power_failure(
 
 def test_the_place_of_deleted_files_is_not_public(registry: Registry) -> None:
     publish(registry, "run/1")
-    directory = registry.versions.fetch(LEAGUE, 1)
+    directory = registry.artifacts.path(LEAGUE, 1)
     shutil.rmtree(directory)
     with pytest.raises(FilesMissing, match=re.escape(f"{directory} does not exist; ")) as caught:
-        registry.versions.fetch(LEAGUE, 1)
+        verified(registry, 1)
     assert caught.value.public_message == f"{LEAGUE}/1/manifest.json is missing"
 
 
@@ -55,13 +55,13 @@ def test_a_removed_training_state_is_reported_as_retired(store: Any, tmp_path: P
     with pytest.raises(VersionRetired, match="has no training state any more"):
         store.registry.versions.copy(LEAGUE, 1, TRAINING, tmp_path / "copy")
     assert store.registry.artifacts.read(version.manifest, "shared.onnx") == GRAPH
-    store.registry.versions.fetch(LEAGUE, 1)
+    verified(store.registry, 1)
 
 
 def test_a_version_is_published_with_all_files_or_none(store: Any) -> None:
     registry = store.registry
     with pytest.raises(UnknownVersion):
-        registry.versions.fetch(LEAGUE, 1)
+        verified(registry, 1)
     version = publish(registry, "run/1")
     assert store.names() == [f"{LEAGUE}/1/{name}" for name in FILES]
     assert registry.artifacts.read(version.manifest, "shared.onnx") == GRAPH
@@ -79,24 +79,24 @@ def test_a_changed_or_missing_file_is_detected_and_named(store: Any, name: str) 
     version = publish(store.registry, "run/1")
     store.replace(f"{LEAGUE}/1/{name}", b"tampered")
     with pytest.raises(ArtifactCorrupt, match=f"{LEAGUE}/1/{name} was changed") as caught:
-        store.registry.versions.fetch(LEAGUE, 1)
+        verified(store.registry, 1)
     assert "\n" not in str(caught.value)
     if name == "shared.onnx":
         with pytest.raises(ArtifactCorrupt, match=r"shared\.onnx was changed"):
             store.registry.artifacts.read(version.manifest, name)
     store.remove(f"{LEAGUE}/1/{name}")
     with pytest.raises(ArtifactCorrupt, match=f"{LEAGUE}/1/{name} is missing"):
-        store.registry.versions.fetch(LEAGUE, 1)
+        verified(store.registry, 1)
 
 
 def test_what_does_not_belong_to_a_version_is_named(registry: Registry) -> None:
     publish(registry, "run/1")
-    directory = registry.versions.fetch(LEAGUE, 1)
+    directory = registry.artifacts.path(LEAGUE, 1)
     (directory / "training" / "more.pkl").touch()
     with pytest.raises(ArtifactCorrupt, match=r"more\.pkl does not belong to"):
-        registry.versions.fetch(LEAGUE, 1)
+        verified(registry, 1)
     (directory / "training" / "more.pkl").unlink()
     (directory / "training").rename(directory.parent / "elsewhere")
     (directory / "training").symlink_to(directory.parent / "elsewhere")
     with pytest.raises(ArtifactCorrupt, match=r"training does not belong to"):
-        registry.versions.fetch(LEAGUE, 1)
+        verified(registry, 1)
