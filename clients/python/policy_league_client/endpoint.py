@@ -84,7 +84,7 @@ class Endpoint:
         url = self.url + call.path
         if not isinstance(outcome, httpx.Response):
             raise RemoteError(f"{url} cannot be reached{through_proxy(url)}: {one_line(outcome)}") from outcome
-        body = parse_object(outcome)
+        body = parse_object(outcome.content)
         if outcome.status_code in (200, 202) and body is not None:
             return call.parse(body, outcome.headers.get("x-league-replica", ""))
         raise parse_error(outcome, url)

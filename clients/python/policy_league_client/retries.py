@@ -58,7 +58,7 @@ def retry_deadline(outcome: Outcome) -> float:
     """Return the seconds for which a failure is worth retrying: 0, a few, or infinity."""
     if not isinstance(outcome, httpx.Response) or outcome.status_code in BUSY_STATUSES:
         return float("inf")
-    body = parse_object(outcome)
+    body = parse_object(outcome.content)
     if body is None:
         # Responses of a proxy that is not configured by this project, or knows no replica yet (404).
         return float("inf") if outcome.status_code >= 500 else NOT_READY_DEADLINE * (outcome.status_code == 404)
@@ -67,10 +67,10 @@ def retry_deadline(outcome: Outcome) -> float:
     return NOT_READY_DEADLINE * (outcome.status_code == 503)
 
 
-def parse_object(response: httpx.Response) -> dict[str, Any] | None:
-    """Return the JSON object in a response; None if it has another body and is not from a policy server."""
+def parse_object(content: str | bytes) -> dict[str, Any] | None:
+    """Return the JSON object in a response or message; None if it is something else, and not from a policy server."""
     try:
-        body = orjson.loads(response.content)
+        body = orjson.loads(content)
     except orjson.JSONDecodeError:
         return None
     return body if isinstance(body, dict) else None
@@ -86,7 +86,7 @@ def retry_after(outcome: Outcome) -> float:
 
 def parse_error(response: httpx.Response, url: str) -> LeagueError:
     """Return the error in a response: RemoteError if it has no `code` and `message`."""
-    body = parse_object(response)
+    body = parse_object(response.content)
     if body is None or "code" not in body or "message" not in body:
         return RemoteError(f"{url} returned status {response.status_code}: {response.text[:200]}")
     kind = BY_CODE.get(body["code"])

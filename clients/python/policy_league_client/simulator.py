@@ -7,7 +7,6 @@ their actions. `simulate` drives objects with `reset` and `step`; a game with a 
 The messages are described in the documentation under "Simulators".
 """
 
-import json
 import os
 import struct
 import threading
@@ -27,7 +26,7 @@ from policy_league_client.endpoint import DEFAULT_URL, Endpoint
 from policy_league_client.errors import InvalidInput, RemoteError, one_line
 from policy_league_client.refs import check_slug
 from policy_league_client.requests import encode
-from policy_league_client.retries import MAX_DELAY, NOT_READY_DEADLINE, parse_error, retry_deadline
+from policy_league_client.retries import MAX_DELAY, NOT_READY_DEADLINE, parse_error, parse_object, retry_deadline
 from policy_league_client.stream_protocol import CONNECTION_ERRORS, PERMANENT_CLOSE_CODES
 from policy_league_client.transport import Connection, connect, receive
 
@@ -306,11 +305,8 @@ class SimulatorConnection:
         return ActionRows(layout, episodes, agents, actions)
 
     def _object(self, message: str | bytes) -> dict[str, Any]:
-        try:
-            document = json.loads(message)
-        except ValueError:
-            document = None
-        if not isinstance(document, dict):
+        document = parse_object(message)
+        if document is None:
             raise RemoteError(f"the server sent no JSON object: {message[:200]!r}")
         if document.get("type") == "error":
             raise InvalidInput(str(document.get("message")))

@@ -8,7 +8,6 @@ response, because messages without a response were not applied.
 from collections.abc import Mapping
 
 import httpx
-import orjson
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 
 from policy_league_client.endpoint import Endpoint
@@ -23,7 +22,7 @@ from policy_league_client.responses import (
     parse_action_response,
     parse_batch_action_response,
 )
-from policy_league_client.retries import Outcome, Retries, parse_error
+from policy_league_client.retries import Outcome, Retries, parse_error, parse_object
 
 OK = 200
 PERMANENT_CLOSE_CODES: dict[int, type[LeagueError]] = {
@@ -99,10 +98,9 @@ class StreamProtocol:
         Returns None if the message is not a response, else an outcome; with status 200, `last` is the response.
         Raises RemoteError.
         """
-        try:
-            body = orjson.loads(message)
-        except orjson.JSONDecodeError as error:
-            raise RemoteError(f"{self.url} did not return JSON: {message[:200]!r}") from error
+        body = parse_object(message)
+        if body is None:
+            raise RemoteError(f"{self.url} did not return JSON: {message[:200]!r}")
         if "closing" in body:
             return None
         if "code" in body:
