@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from typing import Any, NamedTuple, Protocol
 
@@ -335,24 +336,21 @@ class SimulatedEpisode:
 
         Raises EpisodeAbandoned if nobody waits for the episode any more, and LeagueError if a report is invalid.
         """
+        waiting = {report.agent for report in reports if not (report.terminated or report.truncated)}
+        actions: dict[str, Any] = {}
         try:
-            return self._act(reports)
+            self._connection.report((self.number, report) for report in reports)
+            while waiting - actions.keys():
+                event = self._connection.receive()
+                if isinstance(event, ActionRows):
+                    actions |= {agent: action for _, agent, action in _by_agent(self._connection, event)}
+                elif isinstance(event, Abandon) and self.number in event.episodes:
+                    self.is_abandoned = True
+                    raise EpisodeAbandoned(f"the server waits for episode {self.number} no longer")
         except CONNECTION_ERRORS as error:
             self.is_abandoned = True
             _raise_if_permanent(error)
             raise EpisodeAbandoned(f"the connection was lost in episode {self.number}: {one_line(error)}") from error
-
-    def _act(self, reports: Sequence[Report]) -> dict[str, Any]:
-        self._connection.report((self.number, report) for report in reports)
-        waiting = {report.agent for report in reports if not (report.terminated or report.truncated)}
-        actions: dict[str, Any] = {}
-        while waiting - actions.keys():
-            event = self._connection.receive()
-            if isinstance(event, ActionRows):
-                actions |= {agent: action for _, agent, action in _by_agent(self._connection, event)}
-            elif isinstance(event, Abandon) and self.number in event.episodes:
-                self.is_abandoned = True
-                raise EpisodeAbandoned(f"the server waits for episode {self.number} no longer")
         return actions
 
     def end(self, *reports: Report) -> None:
@@ -406,8 +404,8 @@ class Simulator:
         stop: threading.Event | None = None,
     ) -> None:
         self._stop = stop or threading.Event()
-        self._endpoint = Endpoint(url or os.environ.get("LEAGUE_URL") or DEFAULT_URL, key, None, timeout)
-        self._league, self._name, self._version, self._binary = league, name, version, binary
+        endpoint = Endpoint(url or os.environ.get("LEAGUE_URL") or DEFAULT_URL, key, None, timeout)
+        self._connect = partial(SimulatorConnection, endpoint, league, name, version, binary=binary)
 
     def connected(self, episodes: int = 1) -> Iterator[SimulatorConnection]:
         """Yield connections until `stop` is set, each after the previous one was lost, or nothing needed simulators.
@@ -417,9 +415,7 @@ class Simulator:
         delay = MAX_DELAY
         while not self._stop.is_set():
             try:
-                connection = SimulatorConnection(
-                    self._endpoint, self._league, self._name, self._version, episodes, self._binary
-                )
+                connection = self._connect(episodes)
             except CONNECTION_ERRORS as error:
                 _raise_if_permanent(error)
                 self._stop.wait(delay)
@@ -527,17 +523,15 @@ class _Table:
                     self._playing[episode] = game, {}
                     self._read(episode, game.reset(seed), reports, over)
             case ActionRows():
-                ready: list[int] = []
                 for episode, agent, action in _by_agent(self._connection, event):
-                    if episode in self._playing:  # it may have been abandoned
-                        self._playing[episode][1][agent] = action
-                        self._waiting[episode].discard(agent)
-                        if not self._waiting[episode]:
-                            ready.append(episode)
-                for episode in ready:
+                    if episode not in self._playing:
+                        continue  # it has been abandoned
                     game, actions = self._playing[episode]
-                    self._playing[episode] = game, {}
-                    self._read(episode, game.step(actions), reports, over)
+                    actions[agent] = action
+                    self._waiting[episode].discard(agent)
+                    if not self._waiting[episode]:
+                        self._playing[episode] = game, {}
+                        self._read(episode, game.step(actions), reports, over)
             case Abandon():
                 for episode in event.episodes:
                     self._free(episode)
