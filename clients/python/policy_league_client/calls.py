@@ -123,20 +123,19 @@ def promote(ref: str, alias: str, expected: int | None, reason: str | None, key:
     if expected is not ANY:
         body["expected"] = expected
     path = f"/v1/leagues/{next(iter(shares)).league}/aliases/{check_alias(alias)}"
-    return _move_alias(path, body, reason, key)
+    return _change(path, _parse_promotion, body, reason, key)
 
 
 def rollback(slug: str, expected: int, reason: str | None, key: str | None) -> ApiCall[Promotion]:
     """Restore the previous champion."""
     body = {} if expected is ANY else {"expected": expected}
-    return _move_alias(f"/v1/leagues/{check_slug('league', slug)}/rollback", body, reason, key)
+    path = f"/v1/leagues/{check_slug('league', slug)}/rollback"
+    return _change(path, _parse_promotion, body, reason, key)
 
 
 def evaluate(slug: str, options: Mapping[str, Any], reason: str | None, key: str | None) -> ApiCall[JsonObject]:
     """Start an evaluation. options: further fields of the body of `POST …/evaluations`."""
-    body = dict(options) if reason is None else {**options, "reason": reason}
-    headers = {"idempotency-key": key or str(uuid4())}
-    return ApiCall(_evaluations_path(slug), lambda body, _: body, to_json(body), headers)
+    return _change(_evaluations_path(slug), lambda body, _: body, options, reason, key)
 
 
 def evaluation(slug: str, number: int) -> ApiCall[JsonObject]:
@@ -195,11 +194,12 @@ def _evaluations_path(slug: str) -> str:
     return f"/v1/leagues/{check_slug('league', slug)}/evaluations"
 
 
-def _move_alias(path: str, body: JsonObject, reason: str | None, key: str | None) -> ApiCall[Promotion]:
-    if reason is not None:
-        body["reason"] = reason
-    headers = {"idempotency-key": key or str(uuid4())}
-    return ApiCall(path, _parse_promotion, to_json(body), headers)
+def _change(
+    path: str, parse: Callable[[JsonObject, str], T], body: Mapping[str, Any], reason: str | None, key: str | None
+) -> ApiCall[T]:
+    """Return a call that changes something. key: a request with the same one is applied once."""
+    content = to_json(body if reason is None else {**body, "reason": reason})
+    return ApiCall(path, parse, content, {"idempotency-key": key or str(uuid4())})
 
 
 def _parse_promotion(body: JsonObject, _: str) -> Promotion:
