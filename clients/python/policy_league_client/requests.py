@@ -87,8 +87,7 @@ def _encode_array(array: NDArray, encoding: Encoding) -> Any:
 
 def _encode_image(image: NDArray) -> str | list[str]:
     """Return one PNG, or several PNGs that share the channels."""
-    if image.ndim == 2:
-        return _encode_png(image)
+    image = image.reshape(*image.shape[:2], -1)
     parts = [image[..., first : first + PNG_CHANNELS] for first in range(0, image.shape[2], PNG_CHANNELS)]
     return _encode_png(parts[0]) if len(parts) == 1 else [_encode_png(part) for part in parts]
 
@@ -97,7 +96,7 @@ def _encode_png(image: NDArray) -> str:
     from PIL import Image
 
     file = io.BytesIO()
-    flat = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+    flat = image[..., 0] if image.shape[2] == 1 else image
     Image.fromarray(np.ascontiguousarray(flat)).save(file, "PNG", compress_level=PNG_COMPRESSION)
     return b64encode(file.getbuffer()).decode()
 
