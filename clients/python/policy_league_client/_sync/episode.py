@@ -41,23 +41,15 @@ class Episode:
         self._model = model
         self._explore = explore
         self._seed = seed
-        self._last: ActionResponse | None = None
-        self._steps = 0
+        self.last: ActionResponse | None = None
+        """The last response, with digest, seed and probabilities; None before the first action."""
+        self.steps = 0
+        """Number of actions so far."""
 
     @property
     def version(self) -> int | None:
         """The version that answers; None before the first action."""
-        return self._last.version if self._last else None
-
-    @property
-    def last(self) -> ActionResponse | None:
-        """The last response, with digest, seed and probabilities; None before the first action."""
-        return self._last
-
-    @property
-    def steps(self) -> int:
-        """Number of actions so far."""
-        return self._steps
+        return self.last.version if self.last else None
 
     def act(
         self,
@@ -86,21 +78,21 @@ class Episode:
             observation,
             self._client.encoding,
             explore=self._explore,
-            seed=None if self._seed is None else derive(self._seed, self._steps),
+            seed=None if self._seed is None else derive(self._seed, self.steps),
             probabilities=probabilities,
-            state=self._last.state if self._last else None,
+            state=self.last.state if self.last else None,
             deadline_ms=deadline_ms,
             analysis=analysis,
         )
         try:
             response = self._client.send(calls.act(self._model, request))
         except VERSION_GONE as error:
-            if self._last is None:
+            if self.last is None:
                 raise
-            raise episode_interrupted(self._model, self._steps, error) from error
+            raise episode_interrupted(self._model, self.steps, error) from error
         self._model = self._model.at(response.version)
-        self._last = response
-        self._steps += 1
+        self.last = response
+        self.steps += 1
         return response.action
 
     def __enter__(self) -> Self:
