@@ -16,18 +16,7 @@ def declared(config: ExternalConfig) -> Any:
 
     Raises ConfigError for a space that does not exist, such as one with an unknown dtype.
     """
-    spaces = {
-        agent: (_space(agent, "observation", agent_spaces.observation), _space(agent, "action", agent_spaces.action))
-        for agent, agent_spaces in config.agents.items()
-    }
-    env = (_ParallelGame if config.simultaneous else _TurnBasedGame)(config, spaces)
-    # Whoever acts at once hides his action: `simultaneous` says so for the others.
-    env.metadata = (
-        {}
-        if config.simultaneous and not config.hidden_information
-        else {"hidden_information": config.hidden_information}
-    )
-    return env
+    return (_ParallelGame if config.simultaneous else _TurnBasedGame)(config)
 
 
 def _space(agent: str, kind: str, space: Space) -> gymnasium.Space[Any]:
@@ -40,12 +29,16 @@ def _space(agent: str, kind: str, space: Space) -> gymnasium.Space[Any]:
 
 
 class _Declared:
-    def __init__(
-        self, config: ExternalConfig, spaces: dict[str, tuple[gymnasium.Space[Any], gymnasium.Space[Any]]]
-    ) -> None:
-        self._simulator, self._spaces = config.simulator, spaces
-        self.possible_agents = list(spaces)
-        self.agents: list[str] = []
+    def __init__(self, config: ExternalConfig) -> None:
+        self._simulator = config.simulator
+        self._spaces = {
+            agent: (_space(agent, "observation", spaces.observation), _space(agent, "action", spaces.action))
+            for agent, spaces in config.agents.items()
+        }
+        self.possible_agents, self.agents = list(config.agents), list[str]()
+        # Whoever acts at once hides his action: `simultaneous` says so for the others.
+        is_declared = config.hidden_information or not config.simultaneous
+        self.metadata = {"hidden_information": config.hidden_information} if is_declared else {}
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Return the declared space."""
@@ -62,13 +55,15 @@ class _Declared:
             " but not shown or examined here"
         )
 
+    step = render = observe = reset
+
     def close(self) -> None:
         """Do nothing."""
 
 
 class _TurnBasedGame(_Declared, AECEnv):
-    step = render = observe = _Declared.reset
+    """Agents act one after the other."""
 
 
 class _ParallelGame(_Declared, ParallelEnv):
-    step = render = _Declared.reset
+    """Agents act at once."""
