@@ -59,24 +59,19 @@ class Advertisement:
         while not self._is_closed.wait(INTERVAL):
             needs, moment = self._needs(), time.monotonic()
             if needs.episodes:
-                needed_at = moment
-            elif moment - needed_at < IDLE:
-                continue
-            else:
+                needed_at, announced = moment, self._gateway
+                gateway = replace(announced, simulators=needs.simulators, waiting=needs.waiting)
+                is_other = gateway.simulators != announced.simulators or bool(gateway.waiting) != bool(
+                    announced.waiting
+                )
+                if is_other or not self._is_announced or moment - announced_at >= LONGEST_INTERVAL:
+                    announced_at, self._gateway = moment, gateway
+                    self._announce()
+            elif moment - needed_at >= IDLE:
                 if self._is_announced:
                     self._withdraw()
                 if needs.simulators:
                     self._dismiss()
-                continue
-            gateway = replace(self._gateway, simulators=needs.simulators, waiting=needs.waiting)
-            is_same = self._is_announced and (gateway.simulators, gateway.waiting > 0) == (
-                self._gateway.simulators,
-                self._gateway.waiting > 0,
-            )
-            if is_same and moment - announced_at < LONGEST_INTERVAL:
-                continue
-            announced_at, self._gateway = moment, gateway
-            self._announce()
 
     def _announce(self) -> None:
         try:
