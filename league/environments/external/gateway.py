@@ -8,9 +8,10 @@ import hmac
 import logging
 import secrets
 import threading
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
+from itertools import count
 from queue import SimpleQueue
 from time import perf_counter
 
@@ -75,32 +76,20 @@ class SimulatorLink:
     is_leaving: bool = False
     """Whether it gets no more episodes."""
 
-
-@dataclass(frozen=True, slots=True)
-class Joined:
-    """A simulator has connected."""
-
-    link: SimulatorLink
+    @property
+    def has_room(self) -> bool:
+        """Whether it can play one more episode."""
+        return len(self.playing) < self.hello.episodes and not self.is_leaving
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
-    """A simulator has sent a message of a number of bytes."""
+class Arrival:
+    """What a simulator has sent: its first message, once it is connected; later ones; why its connection has ended."""
 
     link: SimulatorLink
-    message: Reports | Abandoned
-    size: int
-
-
-@dataclass(frozen=True, slots=True)
-class Left:
-    """The connection of a simulator has ended."""
-
-    link: SimulatorLink
-    reason: str
-
-
-Arrival = Joined | Received | Left
+    message: Hello | Reports | Abandoned | str
+    size: int = 0
+    """Bytes of a later message."""
 
 
 class GatewayServer:
@@ -119,7 +108,8 @@ class GatewayServer:
         self._welcome = codec.welcome(league).decode()
         self.arrivals: SimpleQueue[Arrival] = SimpleQueue()
         self.token = secrets.token_urlsafe(24)
-        self._connections = self._numbers = self.simulators = 0
+        self._numbers = count(1)
+        self._connections = self.simulators = 0
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway", daemon=True)
         self._thread.start()
@@ -127,16 +117,14 @@ class GatewayServer:
         port = self._server.sockets[0].getsockname()[1]
         self.url = f"http://{LOOPBACK}:{port}"
 
-    def send(self, messages: Iterable[tuple[SimulatorLink, str | bytes]]) -> None:
+    def send(self, messages: Sequence[tuple[SimulatorLink, str | bytes]]) -> None:
         """Send messages, each to a simulator. Those to lost ones are dropped."""
-        messages = list(messages)
         if messages:
             self._loop.call_soon_threadsafe(self._put, messages)
 
     def refuse(self, link: SimulatorLink, error: LeagueError) -> None:
         """End the connection of a simulator that has sent something invalid."""
-        logger.warning("Simulator %d (%s) is refused: %s", link.number, link.connection.remote_address, one_line(error))
-        asyncio.run_coroutine_threadsafe(self._refuse(link.connection, error), self._loop)
+        asyncio.run_coroutine_threadsafe(self._refuse(link.number, link.connection, error), self._loop)
 
     def dismiss(self, link: SimulatorLink, reason: str) -> None:
         """End the connection of a simulator, which connects again."""
@@ -190,6 +178,7 @@ class GatewayServer:
         return None
 
     async def _handle(self, connection: ServerConnection) -> None:
+        number = next(self._numbers)
         self._connections += 1
         try:
             async with asyncio.timeout(HELLO_SECONDS):
@@ -201,35 +190,32 @@ class GatewayServer:
                     f" {self._league}, which expects {expected[0]!r} of version {expected[1]!r} (environment.external)"
                 )
             await connection.send(self._welcome)
+            await self._exchange(SimulatorLink(number, hello, connection, asyncio.Queue()))
         except LeagueError as error:
-            logger.warning("A simulator (%s) is refused: %s", connection.remote_address, one_line(error))
-            await self._refuse(connection, error)
-            return
+            await self._refuse(number, connection, error)
         except (ConnectionClosed, TimeoutError):
-            return
+            pass
         finally:
             self._connections -= 1
-        self._connections += 1
+
+    async def _exchange(self, link: SimulatorLink) -> None:
+        """Pass messages on in both directions, until the connection ends. Raises LeagueError for an invalid one."""
         self.simulators += 1
-        self._numbers += 1
-        link = SimulatorLink(self._numbers, hello, connection, asyncio.Queue())
         writer = asyncio.create_task(self._write(link))
-        self.arrivals.put(Joined(link))
+        self.arrivals.put(Arrival(link, link.hello))
         reason = "the connection was lost"
         try:
             await self._read(link)
         except LeagueError as error:
             reason = one_line(error)
-            logger.warning("Simulator %d (%s) is refused: %s", link.number, connection.remote_address, reason)
-            await self._refuse(connection, error)
+            raise
         except ConnectionClosed as closed:
             if closed.rcvd is not None:
                 reason = f"the simulator closed the connection: {closed.rcvd.code} {closed.rcvd.reason}".rstrip()
         finally:
-            self._connections -= 1
             self.simulators -= 1
             writer.cancel()
-            self.arrivals.put(Left(link, reason))
+            self.arrivals.put(Arrival(link, reason))
 
     async def _read(self, link: SimulatorLink) -> None:
         while True:
@@ -242,7 +228,7 @@ class GatewayServer:
             # Images may be a thousand times larger than their encoding.
             size = max(len(message), received.nbytes)
             link.backlog += size
-            self.arrivals.put(Received(link, received, size))
+            self.arrivals.put(Arrival(link, received, size))
 
     async def _write(self, link: SimulatorLink) -> None:
         try:
@@ -251,7 +237,8 @@ class GatewayServer:
         except ConnectionClosed:
             pass
 
-    async def _refuse(self, connection: ServerConnection, error: LeagueError) -> None:
+    async def _refuse(self, number: int, connection: ServerConnection, error: LeagueError) -> None:
+        logger.warning("Simulator %d (%s) is refused: %s", number, connection.remote_address, one_line(error))
         try:
             async with asyncio.timeout(1.0):
                 await connection.send(refusal(error))
@@ -259,7 +246,7 @@ class GatewayServer:
             pass
         await connection.close(INVALID, str(error).encode()[:120].decode(errors="ignore"))
 
-    def _put(self, messages: list[tuple[SimulatorLink, str | bytes]]) -> None:
+    def _put(self, messages: Sequence[tuple[SimulatorLink, str | bytes]]) -> None:
         sent_at = perf_counter()
         for link, message in messages:
             link.sent_at = sent_at

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from league.config.external import ExternalConfig
 from league.environments.external.advertisement import Advertisement, Needs
-from league.environments.external.gateway import Arrival, GatewayServer, Joined, Left, Received, SimulatorLink
+from league.environments.external.gateway import Arrival, GatewayServer, SimulatorLink
 from league.environments.external.messages import (
     MAX_EPISODE,
+    Abandoned,
+    Hello,
     MessageCodec,
     Reports,
     abandon,
@@ -104,7 +106,7 @@ class ExternalStepping(BatchedEnvironment):
         self._finished: list[int] = []
 
     def start(self, next_episodes: NextEpisodes) -> Turn:
-        self._release(np.flatnonzero(self._episodes != NO_EPISODE))
+        self._release(np.arange(self.num_envs))
         self._next_episodes = next_episodes
         self._abandoned, self._lost = no_envs(), []
         self._clear()
@@ -181,18 +183,12 @@ class ExternalStepping(BatchedEnvironment):
     def _hand_out(self) -> None:
         """Give waiting episodes to simulators that can play more, in turn."""
         starts: dict[int, list[int]] = defaultdict(list)
-        while self._queue:
-            free = [
-                link for link in self._links.values() if len(link.playing) < link.hello.episodes and not link.is_leaving
-            ]
-            if not free:
-                break
-            for link in free:
-                if self._queue:
-                    env = self._queue.popleft()
-                    link.playing.add(env)
-                    self._link_of[env] = link.number
-                    starts[link.number].append(env)
+        while self._queue and (free := [link for link in self._links.values() if link.has_room]):
+            for link in free[: len(self._queue)]:
+                env = self._queue.popleft()
+                link.playing.add(env)
+                self._link_of[env] = link.number
+                starts[link.number].append(env)
         sent_at = perf_counter()
         for number, envs in starts.items():
             self._waiting_since[envs] = sent_at
@@ -262,33 +258,30 @@ class ExternalStepping(BatchedEnvironment):
 
     def _process(self, arrival: Arrival) -> None:
         link = arrival.link
-        match arrival:
-            case Joined():
-                self._links[link.number] = link
-                logger.info("Simulator %d has connected: %d episodes at once", link.number, link.hello.episodes)
-                self._hand_out()
-            case Left(reason=reason):
-                if link.number in self._links:
+        if isinstance(arrival.message, Hello):
+            self._links[link.number] = link
+            logger.info("Simulator %d has connected: %d episodes at once", link.number, link.hello.episodes)
+        link.backlog -= arrival.size
+        if link.number not in self._links:
+            return  # refused, while its messages waited
+        before = len(self._finished)
+        try:
+            match arrival.message:
+                case Reports() as reports:
+                    self._read(link, reports)
+                case Abandoned(episodes=episodes):
+                    self._give_up(link, episodes)
+                case str(reason):
                     self._lose(link, reason)
-            case Received(message=message, size=size):
-                link.backlog -= size
-                if link.number not in self._links:
-                    return  # refused, while its messages waited
-                finished = list[int]()
-                try:
-                    if isinstance(message, Reports):
-                        self._read(link, message, finished)
-                    else:
-                        self._give_up(link, message.episodes)
-                except InvalidInput as error:
-                    self._gateway.refuse(link, error)
-                    self._lose(link, str(error))
-                if finished:
-                    self._begin(np.unique(finished))
-                else:
-                    self._hand_out()
+        except InvalidInput as error:
+            self._gateway.refuse(link, error)
+            self._lose(link, str(error))
+        if finished := self._finished[before:]:
+            self._begin(np.unique(finished))
+        else:
+            self._hand_out()
 
-    def _read(self, link: SimulatorLink, message: Reports, finished: list[int]) -> None:
+    def _read(self, link: SimulatorLink, message: Reports) -> None:
         """Add the reports of a message, and the environments whose episodes are over with it. Raises InvalidInput."""
         if link.sent_at:
             link.seconds = max(0.0, perf_counter() - link.sent_at)
@@ -297,7 +290,6 @@ class ExternalStepping(BatchedEnvironment):
         for episode in dict.fromkeys(message.over):
             if (env := self._env(link, episode)) is not None:
                 self._finish(link, env)
-                finished.append(env)
 
     def _env(self, link: SimulatorLink, episode: int) -> int | None:
         """Return the environment of a simulator's episode; None if it has ended, since reports about abandoned ones may
@@ -372,18 +364,16 @@ class ExternalStepping(BatchedEnvironment):
     def _release(self, envs: Indices) -> None:
         """Tell simulators to abandon the episodes of some environments."""
         by_link: dict[int, list[int]] = defaultdict(list)
-        for env in envs.tolist():
+        for env in envs[self._episodes[envs] != NO_EPISODE].tolist():
             episode = int(self._episodes[env])
-            if episode == NO_EPISODE:
-                continue
             if (link := self._links.get(int(self._link_of[env]))) is None:
                 self._queue.remove(env)
                 del self._env_of[episode]
                 self._episodes[env] = NO_EPISODE
-                continue
-            by_link[link.number].append(episode)
-            self._free(link, env)
-            self._drop_rows(episode)
+            else:
+                by_link[link.number].append(episode)
+                self._free(link, env)
+                self._drop_rows(episode)
         self._gateway.send([(self._links[number], abandon(episodes)) for number, episodes in by_link.items()])
 
     def _give_up(self, link: SimulatorLink, episodes: Sequence[int]) -> None:
