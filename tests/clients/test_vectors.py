@@ -115,7 +115,7 @@ def test_what_a_simulator_sends(message: dict[str, Any]) -> None:
 def flattened(read: Reports | Abandoned) -> list[Any]:
     assert isinstance(read, Reports)
     rows = []
-    for _, part in read.rows:
+    for part in read.rows:
         columns = part.envs, part.agents, part.rewards, part.terminations, part.truncations
         for i in range(len(part.envs)):
             observations = [(name, array[i].tolist()) for name, array in part.observations.items()]

@@ -4,9 +4,9 @@ All bytes are a simulator's: sizes are checked before memory is allocated, and e
 client's side is `policy_league_client.simulator`.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,13 @@ from league.environments.stepping import Indices
 from league.environments.vector.vector_env import AgentRows
 from league.errors import InvalidInput, InvalidReward, LeagueError, ObservationError
 from league.interface import AgentInterface
-from league.spaces import ACTION_MASK, DictSpace, Leaf
+from league.spaces import ACTION_MASK, DictSpace
 from league.spaces.arrays import check, check_mask
+from league.spaces.binary_leaves import little_endian
 from league.spaces.observation_codec import ObservationReader, json_type
 from policy_league_client.simulator import (
     ACTIONS,
+    COLUMNS,
     HEADER,
     OVER,
     PROTOCOL,
@@ -37,8 +39,6 @@ MAX_ROWS = 65_536
 MAX_EPISODES = 4096
 """Episodes that a connection may play at the same time."""
 MAX_EPISODE = 2**32 - 1
-ROW_BYTES = 8 + 4 + 2 + 1
-"""Bytes of a report without its observation: reward, episode, agent, flags."""
 KEYS = frozenset(("episode", "agent", "observation", "reward", "terminated", "truncated"))
 
 
@@ -46,14 +46,14 @@ KEYS = frozenset(("episode", "agent", "observation", "reward", "terminated", "tr
 class Reports:
     """A message with reports, and the episodes that are over with them."""
 
-    rows: list[tuple[int, AgentRows]]
-    """(number of the layout, reports of its agents in the order of the message, whose `envs` are episodes)."""
+    rows: list[AgentRows]
+    """Of agents with equal spaces each, in the order of the message. Their `envs` are episodes."""
     over: list[int]
 
     @property
     def nbytes(self) -> int:
         """The size of the observations in memory."""
-        return sum(array.nbytes for _, part in self.rows for array in part.observations.values())
+        return sum(array.nbytes for part in self.rows for array in part.observations.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,43 +80,36 @@ class SpaceLayout:
     Attributes:
         agents: Their indices.
         action: The space of their actions.
-        row_bytes: Bytes of an observation.
+        row_bytes: Bytes of a report.
     """
 
     def __init__(self, agents: Sequence[int], spaces: AgentInterface) -> None:
         assert not isinstance(spaces.action, DictSpace), "action spaces are not dictionaries"
         self.agents, self.action = tuple(agents), spaces.action
         self.reader = ObservationReader(spaces.observation)
-        self.dtypes = [np.dtype(leaf.dtype).newbyteorder("<") for _, _, leaf in self.reader.leaves]
-        self._bytes = [
-            dtype.itemsize * math.prod(leaf.shape)
-            for (_, _, leaf), dtype in zip(self.reader.leaves, self.dtypes, strict=True)
-        ]
-        self.row_bytes = sum(self._bytes)
+        leaves = [(name, np.dtype(leaf.dtype).newbyteorder("<"), leaf.shape) for name, _, leaf in self.reader.leaves]
+        columns = [*(("a report", dtype, ()) for dtype in COLUMNS), *leaves]
+        self._columns = [(name, dtype, shape, dtype.itemsize * prod(shape)) for name, dtype, shape in columns]
+        self.row_bytes = sum(row_bytes for *_, row_bytes in self._columns)
 
-    def read(self, message: memoryview, rows: int) -> dict[str, NDArray]:
-        """Decode the inputs of a binary message, whose masks are not checked. Raises ObservationError."""
-        arrays, at = {}, 0
-        for (name, _, leaf), dtype, row_bytes in zip(self.reader.leaves, self.dtypes, self._bytes, strict=True):
-            size = rows * row_bytes
-            array = np.frombuffer(message[at : at + size], dtype).reshape(rows, *leaf.shape)
-            if dtype.kind == "b" and (array.view(np.uint8) > 1).any():
-                raise ObservationError(f"{name} contains bytes other than 0 and 1, expected bool")
-            arrays[name] = check(name, array.astype(leaf.dtype, copy=False), leaf)
-            at += size
+    def columns(self, message: memoryview, rows: int) -> list[NDArray]:
+        """Return the columns of a block of a binary message. Raises ObservationError for bytes that are no booleans."""
+        arrays, at = [], 0
+        for name, dtype, shape, row_bytes in self._columns:
+            end = at + rows * row_bytes
+            arrays.append(little_endian(name, message[at:end], dtype).reshape(rows, *shape))
+            at = end
         return arrays
 
     def document(self, names: Sequence[str]) -> dict[str, Any]:
         """Return the layout as a simulator gets it."""
-        inputs = [
-            {"name": name, "path": path, "dtype": leaf.dtype, "shape": leaf.shape}
-            for name, path, leaf in self.reader.leaves
-        ]
-        action: Leaf = self.action
         return {
             "agents": [names[agent] for agent in self.agents],
-            "inputs": inputs,
-            "action": {"dtype": action.dtype, "shape": action.shape},
+            "inputs": [
+                {"name": name, "path": path, "dtype": leaf.dtype, "shape": leaf.shape}
+                for name, path, leaf in self.reader.leaves
+            ],
+            "action": {"dtype": self.action.dtype, "shape": self.action.shape},
         }
 
 
@@ -135,9 +128,8 @@ class MessageCodec:
         for index, spaces in enumerate(agents.values()):
             members.setdefault(spaces.model_dump_json(), []).append(index)
         self.layouts = [SpaceLayout(indices, agents[self._names[indices[0]]]) for indices in members.values()]
-        self.layout_of = np.zeros(len(agents), np.int64)
-        for number, layout in enumerate(self.layouts):
-            self.layout_of[list(layout.agents)] = number
+        numbers = {agent: number for number, layout in enumerate(self.layouts) for agent in layout.agents}
+        self.layout_of = [numbers[agent] for agent in range(len(agents))]
 
     def hello(self, message: str | bytes) -> Hello:
         """Read the first message. Raises InvalidInput."""
@@ -146,14 +138,11 @@ class MessageCodec:
             raise InvalidInput(f"the first message has the type {_shown(document.get('type'))}, expected 'hello'")
         if document.get("protocol") != PROTOCOL:
             raise InvalidInput(f"protocol is {_shown(document.get('protocol'))}, expected {PROTOCOL}")
-        simulator = document.get("simulator")
-        if not isinstance(simulator, dict):
-            raise InvalidInput("simulator must be an object with name and version")
-        name, version = simulator.get("name"), simulator.get("version")
-        if not (isinstance(name, str) and isinstance(version, str)):
-            raise InvalidInput("simulator must be an object with name and version, two strings")
-        episodes = _integer("episodes", document.get("episodes", 1), 1, MAX_EPISODES)
-        return Hello(name, version, episodes, document.get("binary") is True)
+        match document:
+            case {"simulator": {"name": str(name), "version": str(version)}}:
+                episodes = _integer("episodes", document.get("episodes", 1), 1, MAX_EPISODES)
+                return Hello(name, version, episodes, document.get("binary") is True)
+        raise InvalidInput("simulator must be an object with name and version, two strings")
 
     def welcome(self, league: str) -> bytes:
         """Return the response to `hello`."""
@@ -179,7 +168,7 @@ class MessageCodec:
     def actions(self, layout: int, episodes: Indices, agents: Indices, actions: NDArray, binary: bool) -> bytes | str:
         """Return the message with the actions, (k, …), of agents with equal spaces."""
         space = self.layouts[layout].action
-        actions = actions.astype(np.dtype(space.dtype), copy=False)
+        actions = actions.astype(np.dtype(space.dtype).newbyteorder("<"), copy=False)
         if not binary:
             rows = [
                 {"episode": episode, "agent": self._names[agent], "action": action}
@@ -187,8 +176,7 @@ class MessageCodec:
             ]
             return orjson.dumps({"type": "actions", "actions": rows}).decode()
         head = HEADER.pack(PROTOCOL, ACTIONS, layout, len(episodes))
-        little = actions.astype(actions.dtype.newbyteorder("<"), copy=False)
-        return b"".join((head, episodes.astype("<u4").tobytes(), agents.astype("<u2").tobytes(), little.tobytes()))
+        return b"".join((head, episodes.astype("<u4").tobytes(), agents.astype("<u2").tobytes(), actions.tobytes()))
 
     def _binary(self, message: bytes, most: int) -> Reports:
         reports, at = Reports([], []), 0
@@ -203,35 +191,33 @@ class MessageCodec:
                 raise InvalidInput(f"the layout is {number}, expected one below {len(self.layouts)}")
             _integer("the number of rows", rows, 1, most)
             at += HEADER.size
-            size = rows * (ROW_BYTES + self.layouts[number].row_bytes)
+            size = rows * self.layouts[number].row_bytes
             if len(message) - at < size:
                 parts = ", ".join(
                     f"{name} {leaf.dtype} {list(leaf.shape)}" for name, _, leaf in self.layouts[number].reader.leaves
                 )
                 raise ObservationError(f"{rows} reports have {len(message) - at} bytes, expected {size}: {parts}")
-            self._read_block(message, at, number, rows, reports)
+            self._read_block(memoryview(message)[at:], number, rows, reports)
             at += size
         return reports
 
-    def _read_block(self, message: bytes, at: int, number: int, rows: int, reports: Reports) -> None:
+    def _read_block(self, message: memoryview, number: int, rows: int, reports: Reports) -> None:
         """Add the reports of agents with equal spaces."""
-        begin = at + rows * ROW_BYTES
-        rewards = np.frombuffer(message, "<f8", rows, at).astype(np.float64)
-        episodes = np.frombuffer(message, "<u4", rows, at + 8 * rows).astype(np.int64)
-        agents = np.frombuffer(message, "<u2", rows, at + 12 * rows).astype(np.int64)
-        flags = np.frombuffer(message, np.uint8, rows, at + 14 * rows)
         layout = self.layouts[number]
-        if not np.isin(agents, layout.agents).all():
-            wrong = int(agents[~np.isin(agents, layout.agents)][0])
-            raise InvalidInput(f"agent {wrong} is not one of layout {number}: {list(layout.agents)}")
+        rewards, episodes, agents, flags, *inputs = layout.columns(message, rows)
+        if foreign := set(agents.tolist()).difference(layout.agents):
+            raise InvalidInput(f"agent {min(foreign)} is not one of layout {number}: {list(layout.agents)}")
         if (flags & ~np.uint8(TERMINATED | TRUNCATED | OVER)).any():
             raise InvalidInput(f"a report has the flags {int(flags.max())}, expected at most 7")
-        _check_rewards(rewards)
-        observations = layout.read(memoryview(message)[begin : begin + rows * layout.row_bytes], rows)
+        if not np.isfinite(rewards).all():
+            raise InvalidReward(f"a reward is {rewards[~np.isfinite(rewards)][0]}, expected a finite number")
+        leaves = layout.reader.leaves
+        observations = {name: check(name, array, leaf) for (name, _, leaf), array in zip(leaves, inputs, strict=True)}
         if (mask := observations.get(ACTION_MASK)) is not None:
             check_mask(mask[(flags & (TERMINATED | TRUNCATED)) == 0])
         terminated, truncated = ((flags & flag) != 0 for flag in (TERMINATED, TRUNCATED))
-        reports.rows.append((number, AgentRows(episodes, agents, observations, rewards, terminated, truncated)))
+        columns = episodes.astype(np.int64), agents.astype(np.int64), observations, rewards.astype(np.float64)
+        reports.rows.append(AgentRows(*columns, terminated, truncated))
         reports.over.extend(episodes[(flags & OVER) != 0].tolist())
 
     def _reports(self, document: dict[str, Any], most: int) -> Reports:
@@ -241,21 +227,19 @@ class MessageCodec:
         parts: dict[tuple[int, bool], list[tuple[int, int, Any, float, bool, bool]]] = {}
         for report in reports:
             row = self._report(report)
-            parts.setdefault((int(self.layout_of[row[1]]), row[4] or row[5]), []).append(row)
+            parts.setdefault((self.layout_of[row[1]], row[4] or row[5]), []).append(row)
         rows = []
         for (number, is_last), part in parts.items():
             episodes, agents, observations, rewards, terminated, truncated = zip(*part, strict=True)
-            rewards_array = np.array(rewards, np.float64)
-            _check_rewards(rewards_array)
             agent_rows = AgentRows(
                 np.array(episodes, np.int64),
                 np.array(agents, np.int64),
                 self.layouts[number].reader.read(observations, is_last=is_last),
-                rewards_array,
+                np.array(rewards, np.float64),  # finite, as all numbers of JSON
                 np.array(terminated, bool),
                 np.array(truncated, bool),
             )
-            rows.append((number, agent_rows))
+            rows.append(agent_rows)
         return Reports(rows, _episodes("over", document.get("over", [])))
 
     def _report(self, report: Any) -> tuple[int, int, Any, float, bool, bool]:
@@ -322,8 +306,3 @@ def _episodes(name: str, value: Any) -> list[int]:
     if not isinstance(value, list) or len(value) > MAX_ROWS:
         raise InvalidInput(f"{name} must be a list of at most {MAX_ROWS} episodes")
     return [_integer(name, episode, 0, MAX_EPISODE) for episode in value]
-
-
-def _check_rewards(rewards: NDArray[np.float64]) -> None:
-    if not np.isfinite(rewards).all():
-        raise InvalidReward(f"a reward is {rewards[~np.isfinite(rewards)][0]}, expected a finite number")

@@ -46,11 +46,11 @@ MOST_LOSSES = 20
 """Consecutive episodes of one environment that simulators may lose or abandon."""
 ALONE = 3.0
 """Seconds without a simulator after which a warning says where to connect one."""
-NO_EPISODE = -1
+NO_ENV = NO_EPISODE = -1
 
 
-Waiting = dict[int, list[tuple[Indices, AgentRows]]]
-"""Number of a layout → (episodes, rows) of each message."""
+Waiting = list[tuple[Indices, AgentRows]]
+"""(episodes, rows) of each message and layout."""
 
 
 class ExternalStepping(BatchedEnvironment):
@@ -101,8 +101,8 @@ class ExternalStepping(BatchedEnvironment):
         self._is_shown = np.zeros(self.num_envs, bool)
         self._env_of: dict[int, int] = {}
         self._queue: deque[int] = deque()
-        self._acting: Waiting = defaultdict(list)
-        self._ended: Waiting = defaultdict(list)
+        self._acting: Waiting = []
+        self._ended: Waiting = []
         self._finished: list[int] = []
 
     def start(self, next_episodes: NextEpisodes) -> Turn:
@@ -149,7 +149,7 @@ class ExternalStepping(BatchedEnvironment):
         sent_at = perf_counter()
         for group, batch in self._pending.items():
             numbers = self._link_of[batch.envs]
-            layout = int(self._codec.layout_of[batch.agents[0]])
+            layout = self._codec.layout_of[batch.agents[0]]
             for number in np.unique(numbers).tolist():
                 rows = np.flatnonzero(numbers == number)
                 if (link := self._links.get(number)) is None:
@@ -285,32 +285,30 @@ class ExternalStepping(BatchedEnvironment):
         """Add the reports of a message, and the environments whose episodes are over with it. Raises InvalidInput."""
         if link.sent_at:
             link.seconds = max(0.0, perf_counter() - link.sent_at)
-        for layout, reports in message.rows:
-            self._read_rows(link, layout, reports)
+        for reports in message.rows:
+            self._read_rows(link, reports)
         for episode in dict.fromkeys(message.over):
-            if (env := self._env(link, episode)) is not None:
+            if (env := self._env(link, episode)) != NO_ENV:
                 self._finish(link, env)
 
-    def _env(self, link: SimulatorLink, episode: int) -> int | None:
-        """Return the environment of a simulator's episode; None if it has ended, since reports about abandoned ones may
-        be under way. Raises InvalidInput.
+    def _env(self, link: SimulatorLink, episode: int) -> int:
+        """Return the environment of a simulator's episode; NO_ENV if it has ended, since reports about abandoned ones
+        may be under way. Raises InvalidInput.
         """
         env = self._env_of.get(episode)
-        if env is not None and self._link_of[env] == link.number:
-            return env
         if env is None and episode <= self._newest:
-            return None
-        raise InvalidInput(f"episode {episode} is not one of this simulator")
+            return NO_ENV
+        if env is None or self._link_of[env] != link.number:
+            raise InvalidInput(f"episode {episode} is not one of this simulator")
+        return env
 
-    def _read_rows(self, link: SimulatorLink, layout: int, reports: AgentRows) -> None:
-        envs_or_none = [self._env(link, episode) for episode in reports.envs.tolist()]
-        envs = np.array([NO_EPISODE if env is None else env for env in envs_or_none], np.int64)
-        rows, episodes = replace(reports, envs=envs), reports.envs
-        if (envs == NO_EPISODE).any():
-            kept = np.flatnonzero(envs != NO_EPISODE)
-            rows, episodes = rows.take(kept), episodes.take(kept)
-        if not len(episodes):
+    def _read_rows(self, link: SimulatorLink, reports: AgentRows) -> None:
+        envs_of_rows = np.array([self._env(link, episode) for episode in reports.envs.tolist()], np.int64)
+        order = np.lexsort((reports.agents, envs_of_rows))
+        order = order[envs_of_rows[order] != NO_ENV]
+        if not len(order):
             return
+        rows, episodes = replace(reports, envs=envs_of_rows).take(order), reports.envs.take(order)
         envs, agents = rows.envs, rows.agents
         slots = envs * len(self.agents) + agents
         twice = self._must_act[envs, agents]
@@ -326,7 +324,7 @@ class ExternalStepping(BatchedEnvironment):
         for waiting, indices in ((self._acting, np.flatnonzero(acts)), (self._ended, np.flatnonzero(~acts))):
             if len(indices):
                 part = rows if len(indices) == len(episodes) else rows.take(indices)
-                waiting[layout].append((episodes.take(indices), part))
+                waiting.append((episodes.take(indices), part))
         self._must_act[envs, agents] = self._is_present[envs, agents] = acts
         self._has_left[envs, agents] = ~acts
         reported = envs[np.isfinite(self._waiting_since[envs])]
@@ -379,7 +377,7 @@ class ExternalStepping(BatchedEnvironment):
     def _give_up(self, link: SimulatorLink, episodes: Sequence[int]) -> None:
         """A simulator cannot finish episodes. Raises InvalidInput if it finishes hardly any."""
         for episode in episodes:
-            if (env := self._env(link, episode)) is not None:
+            if (env := self._env(link, episode)) != NO_ENV:
                 link.abandoned += 1
                 if link.abandoned > MOST_LOSSES:
                     raise InvalidInput(f"the simulator has abandoned {MOST_LOSSES + 1} consecutive episodes")
@@ -413,22 +411,19 @@ class ExternalStepping(BatchedEnvironment):
 
     def _drop_rows(self, episode: int) -> None:
         for waiting in (self._acting, self._ended):
-            for layout, parts in list(waiting.items()):
-                remaining = [(np.flatnonzero(episodes != episode), episodes, rows) for episodes, rows in parts]
-                waiting[layout] = [(episodes[kept], rows.take(kept)) for kept, episodes, rows in remaining if len(kept)]
-                if not waiting[layout]:
-                    del waiting[layout]
+            parts = [(np.flatnonzero(episodes != episode), episodes, rows) for episodes, rows in waiting]
+            waiting[:] = [(episodes.take(kept), rows.take(kept)) for kept, episodes, rows in parts if len(kept)]
 
     def _collected(self) -> Turn:
         acting, ended = (
-            [AgentRows.joined([rows for _, rows in parts]) for _, parts in sorted(waiting.items())]
+            AgentRows.of_spaces((rows for _, rows in waiting), self._codec.layout_of)
             for waiting in (self._acting, self._ended)
         )
         for rows in acting:
             self._is_shown[rows.envs] = True
-        self._pending = self._batches([[rows] for rows in acting])
+        self._pending = self._batches([rows] for rows in acting)
         turn = Turn(self._pending, ended, _sorted(self._finished), _sorted(self._lost))
-        self._acting, self._ended, self._finished = defaultdict(list), defaultdict(list), []
+        self._acting, self._ended, self._finished = [], [], []
         return turn
 
 

@@ -81,7 +81,7 @@ def test_reports_are_read_by_layout() -> None:
         )
     )
     assert isinstance(message, Reports)
-    (_, first), (_, referee), (_, last) = message.rows
+    first, referee, last = message.rows
     assert (first.envs.tolist(), first.agents.tolist(), first.rewards.tolist()) == ([7], [0], [0.5])
     assert referee.observations["observation"].dtype == np.float32
     assert last.terminations.tolist() == [True]
@@ -137,9 +137,10 @@ def test_any_message_is_read_or_refused(message: str | bytes) -> None:
     if isinstance(read, Abandoned):
         assert all(0 <= episode < 2**32 for episode in read.episodes)
         return
-    for layout, rows in read.rows:
+    for rows in read.rows:
         assert np.isfinite(rows.rewards).all()
-        assert np.isin(rows.agents, CODEC.layouts[layout].agents).all()
+        layout = CODEC.layouts[CODEC.layout_of[rows.agents[0]]]
+        assert np.isin(rows.agents, layout.agents).all()
         if "action_mask" in rows.observations:
             assert rows.observations["action_mask"][~rows.has_ended].any(axis=1).all()
 
@@ -147,14 +148,14 @@ def test_any_message_is_read_or_refused(message: str | bytes) -> None:
 def test_binary_reports_are_read_by_blocks() -> None:
     message = CODEC.read(binary(3, flags=2 | 4), episodes=1)
     assert isinstance(message, Reports)
-    ((_, rows),) = message.rows
+    (rows,) = message.rows
     assert rows.truncations.all()
     assert not rows.terminations.any()
     assert message.over == [0, 1, 2]
     assert rows.observations["action_mask"].shape == (3, 3)
     message = CODEC.read(binary(2) + binary(1, layout=1, flags=4, agent=2))
     assert isinstance(message, Reports)
-    assert [(layout, len(rows.envs)) for layout, rows in message.rows] == [(0, 2), (1, 1)]
+    assert [rows.agents.tolist() for rows in message.rows] == [[0, 0], [2]]
     assert message.over == [0]
     for too_many, reason in ((binary(4), "number of rows is 4"), (reports(*[report()] * 4), "at most 3 objects")):
         with pytest.raises(InvalidInput, match=reason):
