@@ -30,7 +30,7 @@ from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 from benchmarks.harness import Quick, Target, in_rounds, rate
 from benchmarks.stock import moves
 from league.config.environment import EnvironmentConfig
-from league.environments.building import build, observation_space
+from league.environments.building import build
 from league.environments.implementation import stepping
 from league.environments.stepping import Batch, Indices, Starts
 from league.spaces import ACTION_MASK
@@ -94,7 +94,7 @@ def batched(config: EnvironmentConfig, num_envs: int, fast_seeds: bool = False) 
 def groups_of(config: EnvironmentConfig) -> list[int]:
     """A group for each kind of observation."""
     with closing(build(config)) as env:
-        spaces = [observation_space(env, agent) for agent in env.possible_agents]
+        spaces = [env.observation_space(agent) for agent in env.possible_agents]
     return [spaces.index(space) for space in spaces]
 
 

@@ -12,8 +12,7 @@ from inspect import signature
 from itertools import chain
 from typing import Any
 
-import gymnasium
-from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo import ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.conversions import aec_to_parallel_wrapper
 from pettingzoo.utils.wrappers import (
@@ -27,7 +26,7 @@ from league.config.environment import EnvironmentConfig
 from league.config.league import LeagueConfig
 from league.config.play import PlayConfig
 from league.entry_points import import_entry_point, import_module, missing
-from league.environments.apis import NAMES, RLlibEnv, api_of, with_api
+from league.environments.apis import NAMES, api_of, with_api
 from league.environments.declared import declared
 from league.environments.info_masks import with_info_masks
 from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
@@ -181,29 +180,13 @@ def _spaces(env: Any, agent: str, entry_point: str) -> AgentInterface:
 
 
 def agent_interface(env: Any, agent: str) -> AgentInterface:
-    """Return the spaces of an agent, for any API. Raises EnvironmentMismatch if they are not supported."""
-    spaces = observation_space(env, agent), action_space(env, agent)
+    """Return the spaces of an agent of a built environment. Raises EnvironmentMismatch if they are not supported."""
+    spaces = env.observation_space(agent), env.action_space(agent)
     try:
         observation, action = map(from_gymnasium, spaces)
         return AgentInterface(observation=with_mask(observation, action), action=action)
     except EnvironmentMismatch as error:
         raise EnvironmentMismatch(f"agent {agent}: {error}") from error
-
-
-def observation_space(env: Any, agent: str) -> gymnasium.Space[Any]:
-    """Return the observation space of an agent, for any API."""
-    space: gymnasium.Space[Any] = _with_spaces(env).observation_space(agent)
-    return space
-
-
-def action_space(env: Any, agent: str) -> gymnasium.Space[Any]:
-    """Return the action space of an agent, for any API."""
-    space: gymnasium.Space[Any] = _with_spaces(env).action_space(agent)
-    return space
-
-
-def _with_spaces(env: Any) -> Any:
-    return env if isinstance(env, AECEnv | ParallelEnv | RLlibEnv) else RLlibEnv(env)
 
 
 def interface(config: LeagueConfig) -> Interface:

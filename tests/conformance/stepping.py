@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 from pettingzoo import AECEnv, ParallelEnv
 
-from league.environments.building import action_space, observation_space
+from league.environments.apis import RLlibEnv
 from league.environments.stepping import BatchedEnvironment, Starts, States, Turn
 from league.random.seeds import generator
 from league.spaces import ACTION_MASK
@@ -45,7 +45,7 @@ def plain_loop(env: Any, seed: int) -> Reports:
     elif isinstance(env, ParallelEnv):
         _parallel(env, seed, reports)
     else:
-        _multi_agent(env, seed, reports)
+        _multi_agent(RLlibEnv(env), seed, reports)
     return reports
 
 
@@ -99,14 +99,14 @@ def _multi_agent(env: Any, seed: int, reports: Reports) -> None:
 def _report(
     env: Any, reports: Reports, agent: str, value: Any, reward: float, terminated: bool, truncated: bool
 ) -> None:
-    arrays = tensors(from_gymnasium(observation_space(env, agent)), value)
+    arrays = tensors(from_gymnasium(env.observation_space(agent)), value)
     copied = {name: np.array(array) for name, array in arrays.items()}
     reports[agent].append((agent, copied, reward, bool(terminated), bool(truncated)))
 
 
 def _answer(env: Any, seed: int, agent: str, reports: Reports) -> Any:
     mask = reports[agent][-1][1].get(ACTION_MASK)
-    return draw(action_space(env, agent), seed, env.possible_agents.index(agent), len(reports[agent]) - 1, mask)
+    return draw(env.action_space(agent), seed, env.possible_agents.index(agent), len(reports[agent]) - 1, mask)
 
 
 def lockstep(
@@ -190,7 +190,8 @@ def assert_stepping_conforms(
     of the other episodes, must be unchanged.
     """
     env = create()
-    spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
+    env = env if isinstance(env, AECEnv | ParallelEnv) else RLlibEnv(env)
+    spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
     abandoned = {seed: number for number, seed in enumerate(seeds[1::2])}
     episodes = lockstep(make(num_envs), spaces, seeds, abandon=abandoned)
     is_cut = False

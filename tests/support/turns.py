@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
-from league.environments.building import action_space, agent_interface, build
+from league.environments.building import agent_interface, build
 from league.environments.implementation import implementation, stepping, stock_stepping
 from league.environments.stepping import Batch, BatchedEnvironment, States, Turn
 from league.environments.vector.vector_env import AgentRows
@@ -186,7 +186,7 @@ def external() -> dict[str, Any]:
 
 def _external(stock: Any) -> dict[str, Any]:
     env = build(stock.environment)
-    spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
+    spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
     with tempfile.TemporaryDirectory() as home:
         registry = simulators.registry(Path(home), simulators.external(stock))
         with (

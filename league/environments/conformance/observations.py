@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.environments.adapters import Observation
-from league.environments.building import agent_interface, observation_space
+from league.environments.building import agent_interface
 from league.environments.conformance.findings import Examination
 from league.environments.conformance.recordings import Recording, joined
 from league.errors import EnvironmentMismatch, InvalidReturn
@@ -31,7 +31,7 @@ class ObservationCheck:
     def __init__(self, agent: str, env: Any, examination: Examination, normalizes: bool) -> None:
         """normalizes: whether training scales floats by their running statistics."""
         self._agent, self._examination = agent, examination
-        self._gymnasium = observation_space(env, agent)
+        self._gymnasium = env.observation_space(agent)
         self._space = agent_interface(env, agent).observation
         self._leaves = inputs(self._space)
         self._raw = {
@@ -114,7 +114,7 @@ def check_constant_observations(episodes: Sequence[Recording], env: Any, examina
         turns = max(map(len, histories))
         if turns < ENOUGH_TURNS or any(len(set(history[len(history) // 2 :])) > 1 for history in histories):
             continue
-        space = observation_space(env, agent)
+        space = env.observation_space(agent)
         if isinstance(space, gymnasium.spaces.Box) and len(space.shape) > 1:
             text = (
                 f"observes a constant image for {turns} turns; some environments draw only with"

@@ -17,7 +17,8 @@ from pettingzoo.utils.wrappers import TerminateIllegalWrapper
 from ray.rllib.env.multi_agent_env import MultiAgentEnv
 
 from league.config.environment import EnvironmentConfig
-from league.environments.building import action_space, build
+from league.environments.apis import RLlibEnv
+from league.environments.building import build
 from league.environments.copies import StockCopies
 from league.environments.implementation import stock_stepping
 from league.environments.lockstep import Lockstep
@@ -144,7 +145,7 @@ def test_agents_terminate_once_and_an_episode_without_agents_is_over() -> None:
 
 
 def test_without_a_state_or_a_request_there_are_none() -> None:
-    for make, states in ((tictactoe_v3.env, True), (StateInInfo, False)):
+    for make, states in ((tictactoe_v3.env, True), (state_in_info, False)):
         assert all(pair == ({}, {}) for pair in turns_of(make, 4, states))
     env = stock_stepping(EnvironmentConfig(entry_point=f"{CLASSIC}rps_v2"), 2, states=True)
     turn = begin(env, [0, 1])
@@ -233,6 +234,10 @@ class StateInInfo(MultiAgentEnv):
         return {"a": {}, "b": {"state": [[self._steps], [self._seed]]}}
 
 
+def state_in_info() -> RLlibEnv:
+    return RLlibEnv(StateInInfo())
+
+
 class WithState(Simultaneous):
     def action_space(self, agent: str) -> gymnasium.Space:
         return gymnasium.spaces.Discrete(2)
@@ -255,7 +260,7 @@ def turns_of(make: Callable[[], Any], steps: int, states: bool = True) -> list[t
     return [(states_of(turn.states), states_of(turn.last_states)) for turn in turns]
 
 
-@pytest.mark.parametrize("make", [StateInInfo, WithState])
+@pytest.mark.parametrize("make", [state_in_info, WithState])
 def test_each_turn_has_the_state_of_its_steps_and_the_last_state_of_an_episode(make: Callable[[], Any]) -> None:
     """RLlib's environments report it in an info."""
     turns = turns_of(make, LENGTH)
@@ -322,7 +327,7 @@ def test_lockstep_equals_the_plain_loop(loop: tuple[str, dict[str, Any]], num_en
 def test_an_episode_depends_on_its_seed_only(case: Case) -> None:
     config = case.league().environment
     env = build(config)
-    spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
+    spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
     envs = stock_stepping(config, 2)
     first = lockstep(envs, spaces, [3, 4], STEPS)
     again = lockstep(envs, spaces, [4, 3], STEPS)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
 from league.environments.adapters import Report, adapter_for, splitter
-from league.environments.building import build, observation_space
+from league.environments.building import build
 from league.environments.vector.tictactoe import TicTacToe
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.spaces import inputs
@@ -26,7 +26,7 @@ class VectorCopies(VectorEnv):
     def _create(self, config: EnvironmentConfig, num_envs: int) -> None:
         envs = [build(config) for _ in range(num_envs)]
         self.num_envs, self.possible_agents = num_envs, tuple(envs[0].possible_agents)
-        spaces = [from_gymnasium(observation_space(envs[0], agent)) for agent in self.possible_agents]
+        spaces = [from_gymnasium(envs[0].observation_space(agent)) for agent in self.possible_agents]
         self._inputs = [inputs(space) for space in spaces]
         self._copies = [adapter_for(env, [splitter(space) for space in spaces]) for env in envs]
         self._acting: list[list[int]] = [[] for _ in envs]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from league.config.environment import EnvironmentConfig
-from league.environments.building import action_space, build
+from league.environments.building import build
 from league.environments.implementation import stock_stepping
 from league.environments.wrappers.transforms import Resize
 from league.environments.wrappers.wrapping import BatchedWrappers
@@ -136,7 +136,7 @@ def test_each_wrapper_steps_in_lockstep_and_follows_the_seed(name: str, api: Any
     kwargs = {"n_pistons": 3} if entry_point == PISTONBALL else {}
     wrapped = config(entry_point, {name: arguments}, api=api, kwargs=kwargs)
     env = build(wrapped)
-    spaces = {agent: action_space(env, agent) for agent in env.possible_agents}
+    spaces = {agent: env.action_space(agent) for agent in env.possible_agents}
     envs = stock_stepping(wrapped, 2)
     first, again = (lockstep(envs, spaces, seeds, 6) for seeds in ([1, 2], [2, 1]))
     for seed in (1, 2):
