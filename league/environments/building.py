@@ -29,7 +29,7 @@ from league.entry_points import import_entry_point, import_module, missing
 from league.environments.apis import NAMES, api_of, with_api
 from league.environments.declared import declared
 from league.environments.info_masks import with_info_masks
-from league.environments.patches import with_drawing, with_one_copy, with_reseeding, with_whole_reset
+from league.environments.patches import replace_pictures, replace_seeding, reset_all_state, set_render_mode
 from league.environments.wrappers.wrapping import wrapped
 from league.errors import ConfigError, EnvironmentMismatch, LeagueError, cause, no_exit
 from league.interface import AgentInterface, Interface
@@ -82,8 +82,7 @@ def with_cycles(env: Any) -> Any:
 
 CHECKING_WRAPPERS = (OrderEnforcingWrapper, AssertOutOfBoundsWrapper, TerminateIllegalWrapper)
 """Removed, because they halve the speed of small games. Lockstep keeps the order and checks masks."""
-AMENDMENTS = (with_drawing, with_whole_reset, with_reseeding, with_one_copy)
-"""Corrections and optimisations of some PettingZoo environments."""
+PATCHES = (set_render_mode, reset_all_state, replace_seeding, replace_pictures)
 
 
 def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
@@ -119,8 +118,8 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
         )
     env = with_api(_without_checks(env), api)
     try:
-        for amend in AMENDMENTS:
-            env = amend(env)
+        for patch in PATCHES:
+            patch(getattr(env, "unwrapped", env))
         if config.wrappers and api == "rllib":
             raise ConfigError(
                 f"environment.wrappers: {config.wrappers[0].name} (number 1): SuperSuit supports only PettingZoo"

@@ -1,4 +1,7 @@
-"""Patches of PettingZoo environments: corrections and optimisations that do not change their rules."""
+"""Patches of PettingZoo environments: corrections and optimisations that do not change their rules.
+
+Each is called with an environment without its wrappers, and changes those that it is for.
+"""
 
 import copy
 import importlib
@@ -11,12 +14,10 @@ from numpy.typing import NDArray
 BASE = "pettingzoo.classic.rlcard_envs.rlcard_base"
 
 
-def with_reseeding(env: Any) -> Any:
-    """Replace `_seed` of RLCard games by Reseeding. Returns `env`."""
-    bare = getattr(env, "unwrapped", env)
-    if any(cls.__module__ == BASE for cls in type(bare).__mro__):
-        bare._seed = Reseeding(bare)
-    return env
+def replace_seeding(env: Any) -> None:
+    """Replace `_seed` of RLCard games by Reseeding."""
+    if any(cls.__module__ == BASE for cls in type(env).__mro__):
+        env._seed = Reseeding(env)
 
 
 class Reseeding:
@@ -48,41 +49,37 @@ DRAWS_NOTHING_UNRENDERED = (
 )
 
 
-def with_drawing(env: Any) -> Any:
-    """Set `render_mode` of environments with image observations that are otherwise constant. Returns `env`.
+def set_render_mode(env: Any) -> None:
+    """Set `render_mode` of environments with image observations that are otherwise constant.
 
     In PettingZoo 1.27 these environments draw their screen, which agents observe, only if `render_mode` is set.
     """
-    bare = getattr(env, "unwrapped", env)
-    if type(bare).__module__ in DRAWS_NOTHING_UNRENDERED and bare.render_mode is None:
-        bare.render_mode = "rgb_array"
-        if hasattr(bare, "_kwargs"):
+    if type(env).__module__ in DRAWS_NOTHING_UNRENDERED and env.render_mode is None:
+        env.render_mode = "rgb_array"
+        if hasattr(env, "_kwargs"):
             # Pong recreates its game at each seeded reset.
-            bare._kwargs = bare._kwargs | {"render_mode": "rgb_array"}
-            bare._seed()
-    return env
+            env._kwargs = env._kwargs | {"render_mode": "rgb_array"}
+            env._seed()
 
 
 KNIGHTS_ARCHERS_ZOMBIES = "pettingzoo.butterfly.knights_archers_zombies.knights_archers_zombies"
 
 
-def with_whole_reset(env: Any) -> Any:
-    """Reset all state of knights, archers, zombies. Returns `env`.
+def reset_all_state(env: Any) -> None:
+    """Let resets of knights, archers, zombies clear all state.
 
     Without this patch, the time of the first zombie depends on the previous episode.
     """
-    bare = getattr(env, "unwrapped", env)
-    if type(bare).__module__ != KNIGHTS_ARCHERS_ZOMBIES:
-        return env
-    stock = bare.reset
+    if type(env).__module__ != KNIGHTS_ARCHERS_ZOMBIES:
+        return
+    stock = env.reset
 
     def reset(seed: int | None = None, options: dict[str, Any] | None = None) -> None:
-        bare.zombie_spawn_interval.reset()
-        bare.kill_list.clear()
+        env.zombie_spawn_interval.reset()
+        env.kill_list.clear()
         stock(seed=seed, options=options)
 
-    bare.reset = reset
-    return env
+    env.reset = reset
 
 
 PISTONBALL = "pettingzoo.butterfly.pistonball.pistonball"
@@ -90,14 +87,12 @@ BGR = (0xFF0000, 0x00FF00, 0x0000FF)
 """Color masks of a screen with the bytes blue, green, red, unused."""
 
 
-def with_one_copy(env: Any) -> Any:
-    """Replace `observe` of pistonball by Pictures, if the screen has the expected format. Returns `env`."""
-    bare = getattr(env, "unwrapped", env)
-    if type(bare).__module__ == PISTONBALL and bare.render_mode != "human" and sys.byteorder == "little":
-        screen = bare.screen
+def replace_pictures(env: Any) -> None:
+    """Replace `observe` of pistonball by Pictures, if the screen has the expected format."""
+    if type(env).__module__ == PISTONBALL and env.render_mode != "human" and sys.byteorder == "little":
+        screen = env.screen
         if screen.get_bitsize() == 32 and tuple(screen.get_masks()[:3]) == BGR:
-            Pictures(bare)
-    return env
+            Pictures(env)
 
 
 class Pictures:
