@@ -1,17 +1,16 @@
-"""The three APIs of environments: which of them an environment has, and its agents and spaces in one form for all.
+"""The three APIs of environments: which of them an environment has, and its spaces in one form for all.
 
-The result is an AECEnv, a ParallelEnv or an `RLlibEnv`, whose agents are strings, and whose methods `observation_space`
-and `action_space` return the spaces of an agent. Agents that are no strings, such as the integers of RLlib's examples,
-get their texts as names; the environment itself receives its own ids.
+The result is an AECEnv, a ParallelEnv or an `RLlibEnv`, whose methods `observation_space` and `action_space` return the
+spaces of an agent.
 """
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
 import gymnasium
 from pettingzoo import AECEnv, ParallelEnv
-from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
+from pettingzoo.utils import BaseParallelWrapper
 
 from league.errors import EnvironmentMismatch, no_exit
 
@@ -34,8 +33,6 @@ def with_api(env: Any, api: str) -> Any:
     """Return `env` as an AECEnv, a ParallelEnv or an `RLlibEnv`. api: one that it has.
 
     An environment whose agents or spaces exist only after a reset is reset once.
-
-    Raises EnvironmentMismatch if two agents have the same name.
     """
     if api == "rllib":
         env = RLlibEnv(env)
@@ -44,15 +41,7 @@ def with_api(env: Any, api: str) -> Any:
     if not _has_spaces(env):
         with suppress(Exception):  # the next one to read the spaces reports what is missing
             env.reset(seed=0)
-    ids: dict[str, Any] = {}
-    for agent in getattr(env, "possible_agents", ()) or ():
-        if (name := _name(agent)) in ids:
-            raise EnvironmentMismatch(f"agents {ids[name]!r} and {agent!r} have the same name, expected different ones")
-        ids[name] = agent
-    if all(name is agent for name, agent in ids.items()):
-        return env
-    named = {"aec": _NamedAEC, "parallel": _NamedParallel, "rllib": _NamedRLlib}
-    return named[api](env, ids)
+    return env
 
 
 def _has_spaces(env: Any) -> bool:
@@ -63,10 +52,6 @@ def _has_spaces(env: Any) -> bool:
     except Exception:
         return False
     return bool(agents) and all(isinstance(space, gymnasium.Space) for space in spaces)
-
-
-def _name(agent: Hashable) -> str:
-    return agent if isinstance(agent, str) else str(agent)
 
 
 class RLlibEnv:
@@ -88,7 +73,7 @@ class RLlibEnv:
         ids = getattr(env, "_agent_ids", None)
         # RLlib makes the list from this set. The order of a set of strings differs between processes.
         is_unordered = isinstance(agents, set | frozenset) or (isinstance(ids, set) and list(agents) == list(ids))
-        return sorted(agents, key=_name) if is_unordered else list(agents)
+        return sorted(agents, key=str) if is_unordered else list(agents)
 
     def observation_space(self, agent: Any) -> gymnasium.Space[Any]:
         """Return the observation space of an agent. Raises EnvironmentMismatch without one."""
@@ -123,65 +108,3 @@ def _space_in(source: Any, agent: Any) -> gymnasium.Space[Any] | None:
     except LookupError:
         return None
     return space if isinstance(space, gymnasium.Space) else None
-
-
-class _Named:
-    """An environment whose agents have names. agent_ids: name → agent of the environment."""
-
-    def __init__(self, env: Any, agent_ids: Mapping[str, Any]) -> None:
-        super().__init__(env)  # type: ignore[call-arg]
-        self.env: Any = env
-        self.agent_ids = dict(agent_ids)
-
-    @property
-    def possible_agents(self) -> list[str]:
-        return list(self.agent_ids)
-
-    @property
-    def agents(self) -> list[str]:
-        return [_name(agent) for agent in self.env.agents]
-
-    def observation_space(self, agent: str) -> Any:
-        return self.env.observation_space(self.agent_ids[agent])
-
-    def action_space(self, agent: str) -> Any:
-        return self.env.action_space(self.agent_ids[agent])
-
-
-class _NamedSimultaneous(_Named):
-    """Renames the agents of PettingZoo's Parallel API and of RLlib's. Wrong answers stay as they are."""
-
-    def reset(self, **arguments: Any) -> Any:
-        return _all_named(self.env.reset(**arguments))
-
-    def step(self, actions: Mapping[str, Any]) -> Any:
-        return _all_named(self.env.step({self.agent_ids[name]: action for name, action in actions.items()}))
-
-
-class _NamedParallel(_NamedSimultaneous, BaseParallelWrapper): ...
-
-
-class _NamedRLlib(_NamedSimultaneous, RLlibEnv): ...
-
-
-class _NamedAEC(_Named, BaseWrapper):
-    agent_selection = property(lambda self: _name(self.env.agent_selection))
-    rewards = property(lambda self: _named(self.env.rewards))
-    terminations = property(lambda self: _named(self.env.terminations))
-    truncations = property(lambda self: _named(self.env.truncations))
-    infos = property(lambda self: _named(self.env.infos))
-    _cumulative_rewards = property(lambda self: _named(self.env._cumulative_rewards))
-
-    def reset(self, **arguments: Any) -> None:
-        self.env.reset(**arguments)
-
-    def observe(self, agent: str) -> Any:
-        return self.env.observe(self.agent_ids[agent])
-
-
-def _all_named(answer: Any) -> Any:
-    return tuple(map(_named, answer)) if isinstance(answer, tuple) else answer
-
-
-def _named(values: Any) -> Any:
-    return {_name(agent): value for agent, value in values.items()} if isinstance(values, Mapping) else values

@@ -28,7 +28,7 @@ from league.config.play import PlayConfig
 from league.entry_points import import_entry_point, import_module, missing
 from league.environments.apis import NAMES, api_of, with_api
 from league.environments.declared import declared
-from league.environments.info_masks import with_info_masks
+from league.environments.names_and_masks import with_info_masks, with_names
 from league.environments.patches import replace_pictures, replace_seeding, reset_all_state, set_render_mode
 from league.environments.wrappers.wrapping import wrapped
 from league.errors import ConfigError, EnvironmentMismatch, LeagueError, cause, no_exit
@@ -116,7 +116,7 @@ def build(config: EnvironmentConfig, render_mode: str | None = None) -> Any:
         raise ConfigError(
             f"environment.entry_point: {config.entry_point} returned a {type(env).__name__}, expected {expected}"
         )
-    env = with_api(_without_checks(env), api)
+    env = with_names(with_api(_without_checks(env), api))
     try:
         for patch in PATCHES:
             patch(getattr(env, "unwrapped", env))
