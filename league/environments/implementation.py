@@ -14,7 +14,8 @@ from league.environments.external.stepping import ExternalStepping
 from league.environments.lockstep import Lockstep
 from league.environments.stepping import BatchedEnvironment
 from league.environments.vector.vector_env import UnsupportedArguments, VectorEnv
-from league.environments.vector_wrapping import UnsupportedWrapper, wrapped_vector
+from league.environments.vector_wrapping import wrapped_vector
+from league.environments.wrappers.transforms import UnsupportedWrapper
 from league.errors import ConfigError
 from league.registry.gateways import ForSimulators
 from league.stack import VERIFIED, installed

@@ -13,7 +13,7 @@ from pettingzoo import ParallelEnv
 from league.config.environment import EnvironmentConfig, WrapperConfig
 from league.environments.building import build
 from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.environments.wrappers.transforms import Transform, transform
+from league.environments.wrappers.transforms import Transform, UnsupportedWrapper, transform
 from league.environments.wrappers.wrapping import AgentSpaces, agent_spaces, with_arguments
 from league.spaces import OBSERVATION
 
@@ -23,10 +23,6 @@ Change = Callable[[NDArray[Any]], NDArray[Any]]
 OF_ACTIONS = ("pad_action_space_v0", "clip_actions_v0", "scale_actions_v0")
 OF_REWARDS = ("clip_reward_v0",)
 """Wrappers of actions and of rewards. All others are wrappers of observations."""
-
-
-class UnsupportedWrapper(Exception):
-    """A wrapper has no vectorised version, or not for these arguments and spaces. The message is a clause."""
 
 
 class WrapperStack:
@@ -60,20 +56,11 @@ class WrapperStack:
 
         Raises UnsupportedWrapper.
         """
-        transforms = []
-        for wrapper, before, after in zip(self._wrappers, self.stages, self.stages[1:], strict=False):
-            if wrapper.name in (*OF_ACTIONS, *OF_REWARDS):
-                continue
-            space, changed = before.observations[agent], after.observations[agent]
-            made = None
-            if isinstance(space, spaces.Box) and isinstance(changed, spaces.Box):
-                made = transform(wrapper, space, changed, agents, num_envs)
-            if made is None:
-                raise UnsupportedWrapper(
-                    f"wrapper {wrapper.name} has no vectorised version for its arguments and observations in {space}"
-                )
-            transforms.append(made)
-        return transforms
+        return [
+            transform(wrapper, before.observations[agent], after.observations[agent], agents, num_envs)
+            for wrapper, before, after in zip(self._wrappers, self.stages, self.stages[1:], strict=False)
+            if wrapper.name not in (*OF_ACTIONS, *OF_REWARDS)
+        ]
 
 
 class WrappedVectorEnv(VectorEnv):

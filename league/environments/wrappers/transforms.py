@@ -7,6 +7,7 @@ images as four float channels; for pistonball's twenty agents its wrappers doubl
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -17,6 +18,10 @@ from supersuit.utils.basic_transforms.color_reduction import GRAYSCALE_WEIGHTS
 from league.config.environment import WrapperConfig
 
 CHANNELS = {"R": 0, "G": 1, "B": 2}
+
+
+class UnsupportedWrapper(Exception):
+    """A wrapper has no vectorised version, or not for these arguments and spaces. The message is a clause."""
 
 
 class Transform(ABC):
@@ -135,9 +140,13 @@ def channel(mode: str = "full") -> Callable[[NDArray], NDArray] | None:
 
 
 def transform(
-    wrapper: WrapperConfig, space: spaces.Box, changed: spaces.Box, agents: Sequence[str], num_envs: int = 1
-) -> Transform | None:
-    """Return the vectorised version of a SuperSuit wrapper; None if there is none.
+    wrapper: WrapperConfig,
+    space: spaces.Space[Any],
+    changed: spaces.Space[Any],
+    agents: Sequence[str],
+    num_envs: int = 1,
+) -> Transform:
+    """Return the vectorised version of a SuperSuit wrapper. Raises UnsupportedWrapper.
 
     Args:
         wrapper: The wrapper, with arguments validated by SuperSuit.
@@ -147,31 +156,38 @@ def transform(
         num_envs: Number of environments.
     """
     kwargs = wrapper.kwargs
-    match wrapper.name:
-        case "color_reduction_v0":
-            grey = channel(**kwargs) or (lambda rows: (rows.astype(np.float32) @ GRAYSCALE_WEIGHTS).astype(np.uint8))
-            return Stateless(grey)
-        case "resize_v1" if (
-            kwargs.get("linear_interp", True) and min(space.shape[:2]) >= 2 and space.dtype in (np.uint8, np.float32)
-        ):
-            return Resize(space.shape[0], space.shape[1], kwargs["y_size"], kwargs["x_size"])
-        case "frame_stack_v1" if kwargs.get("stack_dim", -1) == -1:
-            return FrameStack(num_envs * len(agents), space, kwargs.get("stack_size", 4))
-        case "agent_indicator_v0":
-            return Indicator(agent_indicator.get_indicator_map(agents, kwargs.get("type_only", False)), space)
-        case "pad_observations_v0":
-            # Zeros are appended until each observation has the new shape.
-            missing = [(0, new - old) for new, old in zip(changed.shape, space.shape, strict=True)]
-            is_equal = changed.shape == space.shape
-            return Stateless(lambda rows: rows if is_equal else np.pad(rows, [(0, 0), *missing]))
-        case "dtype_v0":
-            return Stateless(lambda rows: rows.astype(kwargs["dtype"]))
-        case "flatten_v0":
-            return Stateless(lambda rows: rows.reshape(len(rows), -1))
-        case "reshape_v0":
-            return Stateless(lambda rows: rows.reshape(len(rows), *kwargs["shape"]))
-        case "normalize_obs_v0":
-            low, size, to_low = space.low, space.high - space.low, float(kwargs.get("env_min", 0.0))
-            to_size = float(kwargs.get("env_max", 1.0)) - to_low
-            return Stateless(lambda rows: (rows - low) / size * to_size + to_low)
-    return None
+    if isinstance(space, spaces.Box) and isinstance(changed, spaces.Box):
+        match wrapper.name:
+            case "color_reduction_v0":
+                grey = channel(**kwargs) or (
+                    lambda rows: (rows.astype(np.float32) @ GRAYSCALE_WEIGHTS).astype(np.uint8)
+                )
+                return Stateless(grey)
+            case "resize_v1" if (
+                kwargs.get("linear_interp", True)
+                and min(space.shape[:2]) >= 2
+                and space.dtype in (np.uint8, np.float32)
+            ):
+                return Resize(space.shape[0], space.shape[1], kwargs["y_size"], kwargs["x_size"])
+            case "frame_stack_v1" if kwargs.get("stack_dim", -1) == -1:
+                return FrameStack(num_envs * len(agents), space, kwargs.get("stack_size", 4))
+            case "agent_indicator_v0":
+                return Indicator(agent_indicator.get_indicator_map(agents, kwargs.get("type_only", False)), space)
+            case "pad_observations_v0":
+                # Zeros are appended until each observation has the new shape.
+                missing = [(0, new - old) for new, old in zip(changed.shape, space.shape, strict=True)]
+                is_equal = changed.shape == space.shape
+                return Stateless(lambda rows: rows if is_equal else np.pad(rows, [(0, 0), *missing]))
+            case "dtype_v0":
+                return Stateless(lambda rows: rows.astype(kwargs["dtype"]))
+            case "flatten_v0":
+                return Stateless(lambda rows: rows.reshape(len(rows), -1))
+            case "reshape_v0":
+                return Stateless(lambda rows: rows.reshape(len(rows), *kwargs["shape"]))
+            case "normalize_obs_v0":
+                low, size, to_low = space.low, space.high - space.low, float(kwargs.get("env_min", 0.0))
+                to_size = float(kwargs.get("env_max", 1.0)) - to_low
+                return Stateless(lambda rows: (rows - low) / size * to_size + to_low)
+    raise UnsupportedWrapper(
+        f"wrapper {wrapper.name} has no vectorised version for its arguments and observations in {space}"
+    )

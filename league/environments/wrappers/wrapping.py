@@ -17,7 +17,7 @@ from supersuit.lambda_wrappers.reward_lambda import aec_reward_lambda
 
 from league.config.environment import WrapperConfig
 from league.entry_points import import_entry_point
-from league.environments.wrappers.transforms import Transform, channel, transform
+from league.environments.wrappers.transforms import Transform, UnsupportedWrapper, channel, transform
 from league.errors import ConfigError, cause, no_exit, one_line
 
 
@@ -68,15 +68,16 @@ def batched(
     spaces_before[i]: the agents' observation spaces before wrapper i, as reported by SuperSuit; the last entry is the
     result of all wrappers.
     """
-    transforms = []
-    for wrapper, before, after in zip(wrappers, spaces_before[:-1], spaces_before[1:], strict=True):
-        space = before[0]
-        if not isinstance(space, spaces.Box) or any(other != space for other in before):
-            return None
-        made = transform(wrapper, space, after[0], env.possible_agents)
-        if made is None:
-            return None
-        transforms.append(made)
+    if any(space != before[0] for before in spaces_before[:-1] for space in before):
+        return None
+    firsts = [before[0] for before in spaces_before]
+    try:
+        transforms = [
+            transform(wrapper, space, changed, env.possible_agents)
+            for wrapper, space, changed in zip(wrappers, firsts[:-1], firsts[1:], strict=True)
+        ]
+    except UnsupportedWrapper:
+        return None
     view = channel(**wrappers[0].kwargs) if wrappers[0].name == "color_reduction_v0" else None
     return BatchedWrappers(env, view, transforms[view is not None :], spaces_before[-1])
 
