@@ -15,8 +15,8 @@ import typer
 
 from benchmarks.harness import Quick, Target
 from league.config.environment import EnvironmentConfig
+from league.environments.equality import Comparison, compare
 from league.environments.implementation import VECTORISED, implementation
-from league.environments.vector.equality import Comparison, compare
 
 STEPS = 10**6
 NUM_ENVS = 64

@@ -14,7 +14,7 @@ from pettingzoo.test import api_test, parallel_api_test, seed_test
 
 from benchmarks.optimal_play import blotto_exploitability, crossing_optimum, two_step_values
 from league.config.environment import EnvironmentConfig
-from league.environments.vector.equality import compare
+from league.environments.equality import compare
 from league.random import splitmix64
 from league.results.equilibria import nash_averaging
 from policy_league.examples import kuhn_poker, leduc_holdem

@@ -20,8 +20,8 @@ from league.environments.building import build, describe, describe_policies
 from league.environments.conformance.episodes import Examiner
 from league.environments.conformance.findings import Examination, Vectorised
 from league.environments.conformance.time_budget import TimeBudget
+from league.environments.equality import compare
 from league.environments.implementation import implementation
-from league.environments.vector.equality import compare
 from league.environments.vector.measurement import steps_per_second
 from league.errors import InvalidReturn, LeagueError, cause, no_exit, one_line, raised_at
 from league.interface import Interface

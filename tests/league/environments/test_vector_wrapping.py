@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from league.config.environment import EnvironmentConfig
+from league.environments.equality import compare
 from league.environments.implementation import implementation
-from league.environments.vector.equality import compare
 from league.environments.vector.vector_env import VectorEnv
 from tests.support.environments.plans import Plan, assert_equal, plans
 from tests.support.environments.vector_copies import VectorCopies

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
-from league.environments.vector.equality import DifferentialTest
+from league.environments.equality import DifferentialTest
 from league.environments.vector.random_actions import acting_rows
 from league.environments.vector.vector_env import AgentRows, VectorEnv
 from league.spaces import ACTION_MASK, Box, Discrete, Space

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from league.config.environment import EnvironmentConfig
+from league.environments.equality import DifferentialTest, compare
 from league.environments.vector.connect_four import COLUMNS, ROWS, STRIDE, ConnectFour, has_four
-from league.environments.vector.equality import DifferentialTest, compare
 from league.environments.vector.leduc.deals import deal, fast_deal
 from league.environments.vector.leduc.rules import CALL, RAISE
 from league.environments.vector.leduc_holdem import LeducHoldem

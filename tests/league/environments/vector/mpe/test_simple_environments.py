@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from league.config.environment import EnvironmentConfig
-from league.environments.vector.equality import DifferentialTest, compare
+from league.environments.equality import DifferentialTest, compare
 from league.environments.vector.mpe.initial_states import goals_and_positions
 from league.environments.vector.mpe.particle_env import ParticleEnv
 from league.environments.vector.mpe.simple_adversary import SimpleAdversary

@@ -5,24 +5,19 @@ Everything that the two report must be equal bit for bit.
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
-from time import perf_counter
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
-from league.environments.adapters import Report, adapter_for, splitter
-from league.environments.building import agent_interface, build
-from league.environments.vector.columns import agent_rows
+from league.environments.building import build
+from league.environments.copies import StockCopies
+from league.environments.stepping import Batch
 from league.environments.vector.differences import EnvironmentsDiffer, RowNames, check_reports, check_states
 from league.environments.vector.random_actions import acting, acting_rows, legal_actions
 from league.environments.vector.vector_env import AgentRows, VectorEnv
-from league.spaces import inputs
-from league.spaces.arrays import environment_actions
 
 MAX_SEED = 2**31 - 1
 LONGEST_PHASE = 40
@@ -102,7 +97,6 @@ class DifferentialTest:
 
     Attributes:
         actions: Action space of each agent.
-        stock_seconds: Execution time of the stock copies and their adapters.
         rows: What the vectorised environment reported in the last call, without empty AgentRows.
         acting: The rows of all agents that must act.
         is_over: Whether no agent of a copy must act, (n,) bool. True before the first reset.
@@ -112,37 +106,35 @@ class DifferentialTest:
 
     def __init__(self, config: EnvironmentConfig, vector: VectorEnv) -> None:
         self._vector = vector
-        with ExitStack() as created:
-            envs = [created.enter_context(closing(build(config))) for _ in range(vector.num_envs)]
-            interfaces = {agent: agent_interface(envs[0], agent) for agent in envs[0].possible_agents}
-            splits = [splitter(spaces.observation) for spaces in interfaces.values()]
-            self._stock = [adapter_for(env, splits) for env in envs]
-            created.pop_all()
-        self._agents, self.actions = tuple(interfaces), [spaces.action for spaces in interfaces.values()]
-        leaves = [inputs(spaces.observation) for spaces in interfaces.values()]
-        self._first_alike = [leaves.index(agent_leaves) for agent_leaves in leaves]
-        self._rows = partial(agent_rows, self._agents, leaves, self._first_alike)
-        self._seeds, self._steps = np.zeros((2, vector.num_envs), dtype=np.int64)
-        self.is_over, self.stock_seconds = np.ones(vector.num_envs, dtype=bool), 0.0
+        self._stock = StockCopies(partial(build, config), vector.num_envs)
+        self.actions = self._stock.actions
+        self._steps = np.zeros(vector.num_envs, dtype=np.int64)
+        self.is_over = np.ones(vector.num_envs, dtype=bool)
         self.rows: list[AgentRows] = []
         self.acting: list[AgentRows] = []
         self._earlier: deque[tuple[Sequence[AgentRows], Sequence[AgentRows], RowNames]] = deque()
         self.steps, self.episodes = 0, 0
 
+    @property
+    def stock_seconds(self) -> float:
+        """Execution time of the stock copies and their adapters."""
+        return float(self._stock.seconds.sum())
+
     def reset(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
         """Reset some copies of both. No call if `envs` is empty."""
-        self._seeds[envs], self._steps[envs] = seeds, 0
-        self._call(envs, self._vector.reset, seeds, lambda env: self._stock[env].reset(int(self._seeds[env])))
+        if len(envs):
+            self._stock.seeds[envs], self._steps[envs] = seeds, 0
+            self._compare(envs, self._stock.reset(envs), self._vector.reset, seeds)
 
     def step(self, envs: NDArray[np.int64], actions: NDArray) -> None:
         """Step some copies of both. actions: as for VectorEnv.step. No call if `envs` is empty."""
-        blocks, agents = acting_rows(self.acting, envs), len(self._agents)
-        places = np.sort(np.concatenate([envs[:0], *(block.envs * agents + block.agents for block in blocks)]))
-        moves: dict[int, list[tuple[int, Any]]] = {env: [] for env in envs.tolist()}
-        for place, action in zip(places.tolist(), environment_actions(actions, self.actions[0]), strict=True):
-            moves[place // agents].append((place % agents, action))
+        if not len(envs):
+            return
+        places = [block.envs * len(self.actions) + block.agents for block in acting_rows(self.acting, envs)]
+        acting_envs, agents = np.divmod(np.sort(np.concatenate(places)), len(self.actions))
         self._steps[envs] += 1
-        self._call(envs, self._vector.step, actions, lambda env: self._stock[env].step(moves[env]))
+        rows, _ = self._stock.step(envs, {0: Batch(acting_envs, agents, {}, np.zeros(len(agents)))}, {0: actions})
+        self._compare(envs, rows, self._vector.step, actions)
         self.steps += len(envs)
         self.episodes += int(self.is_over[envs].sum())
 
@@ -156,35 +148,27 @@ class DifferentialTest:
 
     def close(self) -> None:
         """Close the stock copies."""
-        for env in self._stock:
-            env.close()
+        self._stock.close()
 
-    def _call(
+    def _compare(
         self,
         envs: NDArray[np.int64],
+        expected: Sequence[AgentRows],
         call: Callable[[NDArray[np.int64], NDArray], Sequence[AgentRows]],
         values: NDArray,
-        stock_call: Callable[[int], list[Report]],
     ) -> None:
-        if not len(envs):
-            return
-        began = perf_counter()
-        reports = {env: stock_call(env) for env in envs.tolist()}
-        self.stock_seconds += perf_counter() - began
-        expected, lent = self._rows(reports), values.copy()
+        lent = values.copy()
         self.rows = [block for block in call(envs.copy(), lent) if len(block.envs)]
         # The caller may reuse its arrays: a reference in the environment's state would be a fault.
         lent[...] = 0
-        if (agents := tuple(self._vector.possible_agents)) != self._agents:
-            raise EnvironmentsDiffer(f"possible_agents is {agents}, in the stock environment {self._agents}")
-        where = RowNames(agents, self._seeds.copy(), self._steps.copy())
+        if (agents := tuple(self._vector.possible_agents)) != self._stock.agents:
+            raise EnvironmentsDiffer(f"possible_agents is {agents}, in the stock environment {self._stock.agents}")
+        where = RowNames(agents, self._stock.seeds.copy(), self._steps.copy())
         check_reports(expected, self.rows, where)
-        states = [self._stock[env].state() for env in envs]
-        expected_states = None if states[0] is None else np.array([np.ravel(state) for state in states], np.float32)
-        check_states(expected_states, self._vector.state(envs.copy()), where, envs)
+        check_states(self._stock.states(envs), self._vector.state(envs.copy()), where, envs)
         self._earlier.append((expected, self.rows, where))
         self.finish(KEPT)
         copies = np.arange(len(self.is_over))
         resting = acting_rows(self.acting, np.setdiff1d(copies, envs))
-        self.acting = AgentRows.of_spaces(resting + acting_rows(self.rows), self._first_alike)
+        self.acting = AgentRows.of_spaces(resting + acting_rows(self.rows), self._stock.first_alike)
         self.is_over = ~np.isin(copies, acting(self.acting))

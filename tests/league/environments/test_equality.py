@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from league.config.environment import EnvironmentConfig
-from league.environments.vector.equality import compare
+from league.environments.equality import compare
 from league.environments.vector.vector_env import AgentRows
 from tests.support.environments.vector_copies import Looped
 
