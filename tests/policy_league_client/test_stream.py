@@ -192,7 +192,11 @@ def test_a_retry_deadline_of_zero_disables_retries(connect: Connect, slow: tuple
 
 
 def test_another_kind_of_server_is_reported(connect: Connect) -> None:
-    for head, body, message in (({}, "{}", "contains no version"), (VERSION, "<html>", "did not return JSON")):
+    for head, body, message in (
+        ({}, "{}", "contains no version"),
+        (VERSION, "<html>", "did not return a JSON object"),
+        (VERSION, "[1]", "did not return a JSON object"),
+    ):
 
         def respond(connection: ServerConnection, body: str = body) -> None:
             for _ in connection:

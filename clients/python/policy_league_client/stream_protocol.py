@@ -100,7 +100,7 @@ class StreamProtocol:
         """
         body = parse_object(message)
         if body is None:
-            raise RemoteError(f"{self.url} did not return JSON: {message[:200]!r}")
+            raise RemoteError(f"{self.url} did not return a JSON object: {message[:200]!r}")
         if "closing" in body:
             return None
         if "code" in body:
