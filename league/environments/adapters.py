@@ -140,13 +140,15 @@ class AECAdapter(_Adapter):
 class _Simultaneous(_Adapter):
     """Common state of APIs with simultaneous actions: present agents, unreported rewards, last observations."""
 
-    def __init__(self, env: Any, splits: Sequence[Split]) -> None:
-        super().__init__(env, splits)
-        self.infos: Mapping[str, Any] = {}
+    def reset(self, seed: int) -> list[Report]:
+        returned = self._env.reset(seed=seed)
+        self._check("reset", RESET, returned)
+        observations, self.infos = returned
         self._present: set[str] = set()
         self._left: set[str] = set()
-        self._unreported: dict[str, float] = {}
+        self._unreported = dict.fromkeys(self._agents, 0.0)
         self._last_observations: dict[str, Observation] = {}
+        return self._reports(observations, {}, {}, {})
 
     def state(self) -> Any:
         """Return `info["state"]` of any agent or of RLlib's common info, else the environment's `state()`."""
@@ -154,11 +156,6 @@ class _Simultaneous(_Adapter):
             if isinstance(info, Mapping) and "state" in info:
                 return info["state"]
         return _state(self._env)
-
-    def _begin(self, observations: Mapping[str, Any]) -> list[Report]:
-        self._present, self._left, self._last_observations = set(), set(), {}
-        self._unreported = dict.fromkeys(self._agents, 0.0)
-        return self._reports(observations, {}, {}, {})
 
     def _actions(self, moves: Sequence[tuple[int, Any]]) -> dict[str, Any]:
         return {self._agents[agent]: action for agent, action in moves}
@@ -225,12 +222,6 @@ class _Simultaneous(_Adapter):
 class ParallelAdapter(_Simultaneous):
     """PettingZoo's Parallel API: all live agents act simultaneously."""
 
-    def reset(self, seed: int) -> list[Report]:
-        returned = self._env.reset(seed=seed)
-        self._check("reset", RESET, returned)
-        observations, self.infos = returned
-        return self._begin(observations)
-
     def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
         returned = self._env.step(self._actions(moves))
         try:
@@ -254,10 +245,7 @@ class MultiAgentAdapter(_Simultaneous):
     """RLlib's MultiAgentEnv: agents with an observation act; `__all__` ends the episode for all remaining agents."""
 
     def reset(self, seed: int) -> list[Report]:
-        returned = self._env.reset(seed=seed)
-        self._check("reset", RESET, returned)
-        observations, self.infos = returned
-        return self._begin(self._kept(observations)) or self.step(())
+        return super().reset(seed) or self.step(())
 
     def step(self, moves: Sequence[tuple[int, Any]]) -> list[Report]:
         actions = self._actions(moves)
@@ -274,7 +262,7 @@ class MultiAgentAdapter(_Simultaneous):
                     all_terminated = bool(terminated.get("__all__", False))
                     terminated = dict(terminated) | dict.fromkeys(unflagged, all_terminated)
                     truncated = dict(truncated) | dict.fromkeys(unflagged, not all_terminated)
-                reports = ended + self._reports(self._kept(observations), rewards, terminated, truncated)
+                reports = ended + self._reports(observations, rewards, terminated, truncated)
             except UNFIT:
                 self._check("step", STEP, returned)
                 raise
@@ -284,10 +272,16 @@ class MultiAgentAdapter(_Simultaneous):
             actions, ended = {}, reports
         raise InvalidReturn(f"no agent had to act for {MAX_IDLE_STEPS} steps")
 
-    @staticmethod
-    def _kept(observations: Mapping[str, Any]) -> dict[str, Any]:
-        """Copies, because the last observations are used after later steps."""
-        return {agent: _copied(value) for agent, value in observations.items()}
+    def _reports(
+        self,
+        observations: Mapping[str, Any],
+        rewards: Mapping[str, float],
+        terminated: Mapping[str, bool],
+        truncated: Mapping[str, bool],
+    ) -> list[Report]:
+        # Copied, because the last observations are used after later steps.
+        copies = {agent: _copied(value) for agent, value in observations.items()}
+        return super()._reports(copies, rewards, terminated, truncated)
 
 
 def _state(env: Any) -> Any:
