@@ -95,7 +95,9 @@ class _NamesAndMasks:
     def __init__(self, env: Any, agent_ids: Mapping[str, Any], sizes: Mapping[str, int]) -> None:
         super().__init__(env)  # type: ignore[call-arg]
         self.env: Any = env
-        self.agent_ids, self._sizes, self._keeps_names = agent_ids, sizes, _are_names(agent_ids)
+        self._ids, self._sizes, self._keeps_names = agent_ids, sizes, _are_names(agent_ids)
+        if not self._keeps_names:
+            self.agent_ids = agent_ids  # otherwise those of a wrapper below are found, which `render_for` needs
         self._with_masks = {
             agent: Dict({OBSERVATION: env.observation_space(agent), ACTION_MASK: Box(0, 1, (size,), np.int8)})
             for agent, size in sizes.items()
@@ -103,7 +105,7 @@ class _NamesAndMasks:
 
     @property
     def possible_agents(self) -> list[str]:
-        return list(self.agent_ids)
+        return list(self._ids)
 
     @property
     def agents(self) -> list[str]:
@@ -112,10 +114,10 @@ class _NamesAndMasks:
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Return the space of the observation. With a mask, the same object for each call, as PettingZoo requires."""
         space = self._with_masks.get(agent)
-        return self.env.observation_space(self.agent_ids[agent]) if space is None else space
+        return self.env.observation_space(self._ids[agent]) if space is None else space
 
     def action_space(self, agent: str) -> gymnasium.Space[Any]:
-        return self.env.action_space(self.agent_ids[agent])
+        return self.env.action_space(self._ids[agent])
 
     def _named(self, values: Any) -> Any:
         """Return a dictionary by name for one by agent of the environment. A wrong return stays as it is."""
@@ -143,7 +145,7 @@ class _Simultaneous(_NamesAndMasks):
         return self._returned(self.env.reset(**arguments))
 
     def step(self, actions: Mapping[str, Any]) -> Any:
-        return self._returned(self.env.step({self.agent_ids[name]: action for name, action in actions.items()}))
+        return self._returned(self.env.step({self._ids[name]: action for name, action in actions.items()}))
 
     def _returned(self, returned: Any) -> Any:
         if not isinstance(returned, tuple):
@@ -172,4 +174,4 @@ class _AEC(_NamesAndMasks, BaseWrapper):
         self.env.reset(**arguments)
 
     def observe(self, agent: str) -> Any:
-        return self._observed(agent, self.env.observe(self.agent_ids[agent]), self.infos)
+        return self._observed(agent, self.env.observe(self._ids[agent]), self.infos)

@@ -64,6 +64,14 @@ class Rounds(ParallelEnv):
         return np.full((2, 2, 3), self._ids.index(agent), np.uint8)
 
 
+class Masked(Rounds):
+    """`Rounds` with masks in its first infos."""
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> Any:
+        observations, infos = super().reset(seed, options)
+        return observations, {agent: {"action_mask": np.ones(3, np.int8)} for agent in infos}
+
+
 class Group(MultiAgentEnv):
     """`Rounds` with RLlib's API. spaces: where its spaces are."""
 
@@ -187,9 +195,10 @@ def test_agents_of_any_type_have_names_in_results_and_keep_their_ids_in_the_envi
 
 
 def test_the_environments_own_agents_have_different_names() -> None:
-    batched = stepping(league("Rounds", agents=(5, 7)).environment, 1)
-    batched.start(each_agent_alone([0], 2))
-    assert batched.render(0, "7").max() == 1, "a view is requested for its own agent"
+    for entry_point in ("Rounds", "Masked"):
+        batched = stepping(league(entry_point, agents=(5, 7)).environment, 1)
+        batched.start(each_agent_alone([0], 2))
+        assert batched.render(0, "7").max() == 1, "a view is requested for its own agent"
     with pytest.raises(EnvironmentMismatch, match=r"agents 1 and '1' have the same name"):
         build(league("Rounds", agents=(1, "1")).environment)
 
