@@ -21,7 +21,8 @@ from league.policies.graph_runs import open_session
 from league.policies.policy import Arrays
 from league.search.gumbel import SequentialHalving
 from league.search.puct import PUCT
-from league.search.tree import Estimates, Rule, Search
+from league.search.rules import Estimates, Rule
+from league.search.search import Search
 from league.spaces import ACTION_MASK, OBSERVATION, Discrete
 from tests.support.policies.graphs import masked_mlp
 

@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.policies.draws import Generators
-from league.search.tree import ILLEGAL, Nodes, row_maxima, row_sums
+from league.search.array_trees import row_maxima, row_sums
+from league.search.rules import ILLEGAL, Node, Nodes, Score
 
 MOST_CONSIDERED = 16
 """Actions that are considered at the root, at most."""
-VISIT_OFFSET = np.float32(50)
-LAST = np.float32(2**20)
+VISIT_OFFSET = 50
+LAST = 2.0**20
 """The negative score of an action of the root that a round does not visit."""
+TINY = float(np.finfo(float).tiny)
 
 
 class SequentialHalving:
@@ -28,7 +30,7 @@ class SequentialHalving:
     def start(self, roots: Nodes, simulations: int, leaves: int, rng: Generators | None) -> NDArray[np.int64]:
         """See Rule."""
         count, actions = roots.logits.shape
-        self._noise: NDArray[np.float32] = np.zeros((count, actions), dtype=np.float32)
+        self._noise: NDArray[np.float64] = np.zeros((count, actions))
         if rng is not None:
             self._noise[:] = [generator.gumbel(size=actions) for generator in rng]
         considered = np.minimum((roots.logits > ILLEGAL).sum(axis=1), MOST_CONSIDERED)
@@ -41,9 +43,9 @@ class SequentialHalving:
         """Visits of the actions of the root that each round takes, (k, rounds)."""
         return sizes
 
-    def scores(self, nodes: Nodes, roots: int, number: int, leaves: int) -> NDArray[np.float32]:
+    def scores(self, nodes: Nodes, roots: int, number: int, leaves: int) -> NDArray[np.float64]:
         """See Rule."""
-        sent = np.arange(leaves, dtype=np.float32)[:, np.newaxis, np.newaxis]
+        sent = np.arange(leaves)[:, np.newaxis, np.newaxis]
         logits = improved_logits(nodes)
         policy = np.exp(logits - row_maxima(logits))
         policy /= row_sums(policy)
@@ -53,7 +55,23 @@ class SequentialHalving:
         scores[:, :roots] = np.where(is_next & (sent == 0), values, -LAST)
         return scores
 
-    def result(self, roots: Nodes) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def score(self, node: Node, root: int | None, number: int) -> Score:
+        """See Rule."""
+        logits, visits, total = _improved_logits(node), node.visits, 1 + node.total_visits
+        if root is not None:
+            noise, expected_visits = self._noise[root].tolist(), self._visits[root, number]
+
+            def root_score(edge: int, sent: int) -> float:
+                is_next = visits[edge] == expected_visits and not sent
+                return max(logits[edge] + noise[node.actions[edge]], 1 - LAST) if is_next else -LAST
+
+            return root_score
+        highest = max(logits)
+        shares = [math.exp(logit - highest) for logit in logits]
+        scale = sum(shares)
+        return lambda edge, sent: shares[edge] / scale - (visits[edge] + sent) / total
+
+    def result(self, roots: Nodes) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See Rule. The best action is that of the most visited ones with the highest score."""
         logits = improved_logits(roots)
         is_most = roots.visits == row_maxima(roots.visits)
@@ -61,17 +79,34 @@ class SequentialHalving:
         return actions, np.where(roots.logits > ILLEGAL, logits, ILLEGAL)
 
 
-def improved_logits(nodes: Nodes) -> NDArray[np.float32]:
+def improved_logits(nodes: Nodes) -> NDArray[np.float64]:
     """Return logits + σ(q), (k, actions); unspecified for illegal actions."""
     is_visited = nodes.visits > 0
-    priors = np.where(is_visited, np.exp(nodes.logits), np.float32(0))
+    priors = np.where(is_visited, np.exp(nodes.logits), 0.0)
     means = nodes.sums / np.maximum(nodes.visits, 1)
     # Equation 33: the node's evaluation, and the mean of the visited actions, weighted by their priors.
-    weighted = row_sums(priors * means) / np.maximum(row_sums(priors), np.finfo(np.float32).tiny)
+    weighted = row_sums(priors * means) / np.maximum(row_sums(priors), TINY)
     visits = nodes.total_visits[:, np.newaxis]
     mixed = (nodes.value[:, np.newaxis] + visits * weighted) / (1 + visits)
     values = np.where(is_visited, means, mixed)
     return nodes.logits + (VISIT_OFFSET + row_maxima(nodes.visits)) / 2 * (1 + values)
+
+
+def _improved_logits(node: Node) -> list[float]:
+    """The same as `improved_logits` for one node."""
+    visits, sums, total = node.visits, node.sums, node.total_visits
+    mixed, scale = node.value, (VISIT_OFFSET + max(visits)) / 2
+    if total:
+        columns = [
+            (prior, values / count) for prior, values, count in zip(node.priors, sums, visits, strict=True) if count
+        ]
+        weights = sum(prior for prior, _ in columns)
+        weighted = sum(prior * mean for prior, mean in columns) / max(weights, TINY)
+        mixed = (mixed + total * weighted) / (1 + total)
+    return [
+        logit + scale * (1 + (values / count if count else mixed))
+        for logit, values, count in zip(node.logits, sums, visits, strict=True)
+    ]
 
 
 def halving(considered: int, simulations: int, leaves: int) -> list[tuple[int, int]]:

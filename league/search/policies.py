@@ -28,13 +28,17 @@ from league.registry.storage.rows import VersionRow
 from league.search.gumbel import SequentialHalving
 from league.search.puct import PUCT
 from league.search.requirements import searchable
+from league.search.rules import Estimates, Rule
+from league.search.search import Search, SearchResult
 from league.search.searched_actions import SearchedActions
-from league.search.tree import Estimates, Rule, Search, SearchResult
 from league.spaces import Discrete
 
 NODES = 2**16
 """Nodes in memory at once, unless a single search has more."""
 RULES: Mapping[SearchRule, Callable[[], Rule]] = {"puct": PUCT, "gumbel": SequentialHalving}
+
+SIGNS = np.array([[1, -1], [-1, 1]], dtype=np.float32)
+"""Of the value of each agent, if the first and if the second one acts."""
 
 
 class SearchPolicy:
@@ -121,8 +125,11 @@ class SearchPolicy:
             raise
         except Exception as error:
             raise ArtifactCorrupt(f"ONNX Runtime cannot run the value graph: {one_line(error)}") from error
-        value = np.clip(value, -1, 1)
-        return Estimates(logits, np.where(rows.agents == np.array([[0], [1]]), value, -value).T)
+        # Faster than `any` and `clip` for a few rows.
+        if np.count_nonzero(np.isnan(value)) or np.count_nonzero(np.isnan(logits)):
+            raise ArtifactCorrupt("the value graph returns NaN")
+        value = np.minimum(np.maximum(value, -1), 1)
+        return Estimates(logits, value[:, np.newaxis] * SIGNS.take(rows.agents, axis=0))
 
 
 def contestant(

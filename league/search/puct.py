@@ -6,13 +6,15 @@ simulations through an action, or without any the mean value of the node; N(s) i
 most visited action is played.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from league.policies.draws import Generators
-from league.search.tree import ILLEGAL, Nodes
+from league.search.rules import ILLEGAL, Node, Nodes, Score
 
-EXPLORATION = np.float32(1.5)
+EXPLORATION = 1.5
 """The constant c. Silver et al. let it grow from 1.25, by 0.04 in 800 simulations."""
 SHARE = 4
 """A round has at most a SHARE-th of the simulations before it, or one: while a tree is small, each result changes where
@@ -34,9 +36,9 @@ class PUCT:
             before += sizes[-1]
         return np.tile(sizes, (len(roots.logits), 1))
 
-    def scores(self, nodes: Nodes, roots: int, number: int, leaves: int) -> NDArray[np.float32]:  # noqa: ARG002
+    def scores(self, nodes: Nodes, roots: int, number: int, leaves: int) -> NDArray[np.float64]:  # noqa: ARG002
         """See Rule. Roots are nodes like others."""
-        losses = np.arange(leaves, dtype=np.float32)[:, np.newaxis, np.newaxis]
+        losses = np.arange(leaves, dtype=np.float64)[:, np.newaxis, np.newaxis]
         total = 1 + nodes.total_visits
         mean = ((nodes.value + nodes.total) / total)[:, np.newaxis]
         # Without a visit, the mean value of the node counts as one.
@@ -45,7 +47,20 @@ class PUCT:
         scores += np.exp(nodes.logits) * (EXPLORATION * np.sqrt(total))[:, np.newaxis] / (1 + nodes.visits + losses)
         return scores
 
-    def result(self, roots: Nodes) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def score(self, node: Node, root: int | None, number: int) -> Score:  # noqa: ARG002
+        """See Rule."""
+        total = 1 + node.total_visits
+        mean, urgency = (node.value + node.total) / total, EXPLORATION * math.sqrt(total)
+        visits, sums, priors = node.visits, node.sums, node.priors
+
+        def score(edge: int, losses: int) -> float:
+            count = visits[edge]
+            value = (sums[edge] if count else mean) - losses
+            return value / ((count or 1) + losses) + priors[edge] * urgency / (1 + count + losses)
+
+        return score
+
+    def result(self, roots: Nodes) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """See Rule. The improved policy is the share of visits. Of equally visited actions, the better one is best."""
         best = roots.visits == roots.visits.max(axis=1, keepdims=True)
         actions = np.where(best, roots.sums, -np.inf).argmax(axis=1)

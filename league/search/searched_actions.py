@@ -38,7 +38,7 @@ class SearchedActions(Actions):
         """Choose actions.
 
         Args:
-            result: The fields of a `league.search.tree.SearchResult`, and optionally `ns`.
+            result: The fields of a `league.search.search.SearchResult`, and optionally `ns`.
             action: The action space.
             explore: Whether to sample from the improved policy instead of taking the best actions.
             rng: See `Policy.act`.

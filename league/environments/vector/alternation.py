@@ -29,6 +29,8 @@ def rows_after_move(
         over: Whether the game is over, (m,).
         gains: What the mover wins if the game is over, (m,).
     """
+    if not np.count_nonzero(over):
+        return TurnRows(env_ids, movers ^ 1, np.zeros(len(env_ids)), np.zeros(len(env_ids), dtype=bool))
     count = 1 + over
     envs, agents = np.repeat(env_ids, count), np.repeat(movers ^ 1, count)
     rewards, terminations = np.zeros(len(envs)), np.zeros(len(envs), dtype=bool)

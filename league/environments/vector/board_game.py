@@ -39,7 +39,7 @@ class BoardGame(VectorEnv):
         )
 
     def step(self, env_ids: NDArray[np.int64], actions: NDArray[Any]) -> Sequence[AgentRows]:
-        moves = self._moves[env_ids]
+        moves = self._moves.take(env_ids)
         mover = moves & 1
         self._moves[env_ids] = moves + 1
         player = 2 * env_ids + mover

@@ -14,6 +14,7 @@ ROWS, COLUMNS = 6, 7
 STRIDE = ROWS + 1
 DIRECTIONS = np.array([1, STRIDE - 1, STRIDE, STRIDE + 1], dtype=np.uint64)[:, np.newaxis]
 """Distances between neighbouring bits of a vertical line, of both diagonals and of a horizontal line, (4, 1)."""
+TWICE = 2 * DIRECTIONS
 
 BITS = np.left_shift(np.uint64(1), np.arange(COLUMNS * STRIDE, dtype=np.uint64)).reshape(COLUMNS, STRIDE).T[:ROWS]
 BITS = BITS[..., np.newaxis]
@@ -37,10 +38,10 @@ class ConnectFour(BoardGame):
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         column = env_ids * COLUMNS + actions
         heights, boards = self._heights.reshape(-1), self._boards.reshape(-1)
-        height = heights[column]
+        height = heights.take(column)
         heights[column] = height + 1
         self._masks.reshape(-1)[column] = height < ROWS - 1
-        pieces = boards[players] | np.left_shift(np.uint64(1), (actions * STRIDE + height).astype(np.uint64))
+        pieces = boards.take(players) | BITS.take(actions + height * COLUMNS)
         boards[players] = pieces
         return (ROWS - 1 - height) * COLUMNS + actions, has_four(pieces)
 
@@ -62,5 +63,4 @@ class ConnectFour(BoardGame):
 def has_four(boards: NDArray[np.uint64]) -> NDArray[np.bool_]:
     """Return which bitboards (m,) have four pieces in a line."""
     pairs = boards & (boards >> DIRECTIONS)
-    fours = pairs & (pairs >> (2 * DIRECTIONS))
-    return np.bitwise_or.reduce(fours, axis=0) != 0
+    return (pairs & (pairs >> TWICE)).any(axis=0)

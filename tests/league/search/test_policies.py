@@ -3,20 +3,24 @@
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+import onnx
 import pytest
 
 from evaluation.matches.tournament import evaluate
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
 from league.config.play import PlayConfig
-from league.errors import Conflict, InvalidInput
+from league.environments.vector.tictactoe import TicTacToe
+from league.errors import ArtifactCorrupt, Conflict, InvalidInput
 from league.policies.loading import eligible, load
 from league.refs import CheckpointRef
 from league.registry.aliases import ANY
 from league.registry.registry import Registry
 from league.registry.storage.manifest import SEARCH, SearchRule
 from league.registry.storage.rows import Portion, VersionRow
-from league.search.policies import publish_search
+from league.search.policies import SearchPolicy, publish_search
+from league.spaces import Discrete
 from tests.support.leagues import tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
 from tests.support.policies.graphs import masked_mlp
@@ -53,6 +57,16 @@ def test_it_beats_the_version_without_a_search(registry: Registry) -> None:
     result = evaluate(LEAGUE, ["tictactoe@1", "tictactoe@2", "tictactoe@3"], registry=registry, blocks=12)
     scores = {standing.ref: standing.score for standing in result.leaderboard}
     assert min(scores["tictactoe@2"], scores["tictactoe@3"]) > scores["tictactoe@1"] + 0.2
+
+
+@pytest.mark.parametrize("name", ["wv", "w1"])
+def test_a_network_that_returns_nan_is_corrupt(name: str) -> None:
+    model = onnx.load_from_string(masked_mlp((3, 3, 2), 9, has_value=True))
+    (weights,) = (weights for weights in model.graph.initializer if weights.name == name)
+    weights.CopyFrom(onnx.numpy_helper.from_array(np.full(weights.dims, np.nan, np.float32), name))
+    policy = SearchPolicy(TicTacToe, model.SerializeToString(), Discrete(n=9), "puct", 8)
+    with pytest.raises(ArtifactCorrupt, match="the value graph returns NaN"):
+        policy.search({"observation": np.zeros((1, 3, 3, 2), np.int8), "action_mask": np.ones((1, 9), np.int8)})
 
 
 @pytest.mark.parametrize("actions", ["greedy", "sampled"])

@@ -20,12 +20,12 @@ from league.policies.line_games.game import TIC_TAC_TOE
 from league.policies.line_games.solver import LineGameSolver
 from league.search.gumbel import SequentialHalving
 from league.search.puct import PUCT
-from league.search.tree import LEAVES, Estimates, Nodes, Rule, Search, SearchResult
+from league.search.rules import Estimates, Nodes, Rule
+from league.search.search import FEW_GAMES, LEAVES, Search, SearchResult
 from league.spaces import ACTION_MASK, OBSERVATION
 
 RULES: dict[str, Callable[[], Rule]] = {"PUCT": PUCT, "sequential halving": SequentialHalving}
-
-
+MOVES = 6
 ACTIONS = {TicTacToe: 9, ConnectFour: 7}
 
 
@@ -52,14 +52,22 @@ def searched(
     evaluate: Callable[[AgentRows], Estimates] = uniform,
     seed: int | None = None,
     leaves: int = LEAVES,
+    few_games: int = FEW_GAMES,
 ) -> SearchResult:
     """Search from the positions after some games."""
     search = Search(
-        game, evaluate, rule, games=len(games), simulations=simulations, num_actions=ACTIONS[game], leaves=leaves
+        game,
+        evaluate,
+        rule,
+        games=len(games),
+        simulations=simulations,
+        num_actions=ACTIONS[game],
+        leaves=leaves,
+        few_games=few_games,
     )
     rows = [positions(search.env, search.roots, games)]
     rng = None if seed is None else [np.random.default_rng([seed, *actions]) for actions in games]
-    return search.run(rows, rng)
+    return search.run(rows, rng, moves=MOVES)
 
 
 games_of_connect_four = st.lists(st.lists(st.integers(0, 6), max_size=6), min_size=1, max_size=5)
@@ -84,16 +92,54 @@ def test_all_simulations_visit_legal_actions(
 def test_the_result_of_a_game_depends_neither_on_the_others_nor_on_their_order(
     games: list[list[int]], simulations: int, rule_name: str, random: Random
 ) -> None:
-    together = searched(ConnectFour, games, RULES[rule_name](), simulations, hashed, seed=5)
     order = list(range(len(games)))
     random.shuffle(order)
-    shuffled = searched(ConnectFour, [games[i] for i in order], RULES[rule_name](), simulations, hashed, seed=5)
-    alone = searched(ConnectFour, games[:1], RULES[rule_name](), simulations, hashed, seed=5)
+    together, shuffled, alone = (
+        searched(ConnectFour, positions, RULES[rule_name](), simulations, hashed, seed=5, few_games=0)
+        for positions in (games, [games[i] for i in order], games[:1])
+    )
     assert (shuffled.visits == together.visits[order]).all()
     assert (shuffled.actions == together.actions[order]).all()
     assert (shuffled.values == together.values[order]).all()
     assert (alone.visits == together.visits[:1]).all()
     assert (alone.logits == together.logits[:1]).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    games_of_connect_four,
+    st.integers(1, 150),
+    st.sampled_from(sorted(RULES)),
+    st.booleans(),
+    st.integers(1, 12),
+    st.sampled_from([uniform, hashed]),
+)
+def test_trees_of_objects_and_in_arrays_are_equal(
+    games: list[list[int]],
+    simulations: int,
+    rule_name: str,
+    has_noise: bool,
+    leaves: int,
+    evaluate: Callable[[AgentRows], Estimates],
+) -> None:
+    objects, arrays = (
+        searched(
+            ConnectFour,
+            games,
+            RULES[rule_name](),
+            simulations,
+            evaluate,
+            3 if has_noise else None,
+            leaves,
+            few_games=few_games,
+        )
+        for few_games in (len(games), 0)
+    )
+    assert (objects.actions == arrays.actions).all()
+    assert (objects.visits == arrays.visits).all()
+    assert (objects.lines == arrays.lines).all()
+    np.testing.assert_allclose(objects.values, arrays.values, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(objects.logits, arrays.logits, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.slow
