@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from league.policies.draws import Generators
 from league.search.array_trees import row_maxima, row_sums
-from league.search.rules import ILLEGAL, Node, Nodes, Score
+from league.search.rules import ILLEGAL, SHARE, Node, Nodes, Score
 
 MOST_CONSIDERED = 16
 """Actions that are considered at the root, at most."""
@@ -36,11 +36,11 @@ class SequentialHalving:
         considered = np.minimum((roots.logits > ILLEGAL).sum(axis=1), MOST_CONSIDERED)
         numbers, kinds = np.unique(considered, return_inverse=True)
         schedules = [halving(number, simulations, leaves) for number in numbers.tolist()]
-        table = np.zeros((len(numbers), max(map(len, schedules)), 2), dtype=np.int64)
+        table = np.zeros((len(numbers), max(map(len, schedules)), 3), dtype=np.int64)
         for kind, schedule in enumerate(schedules):
             table[kind, : len(schedule)] = schedule
-        sizes, self._visits = table[kinds].transpose(2, 0, 1)
-        """Visits of the actions of the root that each round takes, (k, rounds)."""
+        sizes, self._visits, self._times = table[kinds].transpose(2, 0, 1)
+        """Visits of the actions of the root that each round takes, and how often it visits them, (k, rounds)."""
         return sizes
 
     def scores(self, nodes: Nodes, roots: int, number: int, leaves: int) -> NDArray[np.float64]:
@@ -50,19 +50,22 @@ class SequentialHalving:
         policy = np.exp(logits - row_maxima(logits))
         policy /= row_sums(policy)
         scores = policy - (nodes.visits + sent) / (1 + nodes.total_visits)[:, np.newaxis]
-        is_next = nodes.visits[:roots] == self._visits[:, number, np.newaxis]
+        is_next = (nodes.visits[:roots] == self._visits[:, number, np.newaxis]) & (
+            sent < self._times[:, number, np.newaxis]
+        )
         values = np.maximum(logits[:roots] + self._noise, 1 - LAST)
-        scores[:, :roots] = np.where(is_next & (sent == 0), values, -LAST)
+        scores[:, :roots] = np.where(is_next, values, -LAST)
         return scores
 
     def score(self, node: Node, root: int | None, number: int) -> Score:
         """See Rule."""
         logits, visits, total = _improved_logits(node), node.visits, 1 + node.total_visits
         if root is not None:
-            noise, expected_visits = self._noise[root].tolist(), self._visits[root, number]
+            noise = self._noise[root].tolist()
+            expected_visits, times = self._visits[root, number], self._times[root, number]
 
             def root_score(edge: int, sent: int) -> float:
-                is_next = visits[edge] == expected_visits and not sent
+                is_next = visits[edge] == expected_visits and sent < times
                 return max(logits[edge] + noise[node.actions[edge]], 1 - LAST) if is_next else -LAST
 
             return root_score
@@ -109,21 +112,25 @@ def _improved_logits(node: Node) -> list[float]:
     ]
 
 
-def halving(considered: int, simulations: int, leaves: int) -> list[tuple[int, int]]:
-    """Return for each round its simulations, and the visits that the actions must have among which it takes the best.
+def halving(considered: int, simulations: int, leaves: int) -> list[tuple[int, int, int]]:
+    """Return for each round its simulations, the visits that the actions must have among which it takes the best, and
+    how often it visits each of them.
 
     There are ⌈log₂ considered⌉ phases with equally many simulations. After the last one, the best two actions remain.
     A round visits each of the remaining actions once, up to `leaves` of them: these are different edges of the root, so
-    no simulation depends on another one of its round.
+    no simulation depends on another one of its round. If there are few of them, it visits each up to a SHARE-th as
+    often as before.
     """
     phases = max(1, math.ceil(math.log2(considered)))
-    rounds: list[tuple[int, int]] = []
+    rounds: list[tuple[int, int, int]] = []
     visits, remaining, left = 0, considered, simulations
     while left:
-        for _ in range(max(1, simulations // (phases * remaining))):
-            for first in range(0, min(left, remaining), leaves):
-                rounds.append((min(leaves, remaining - first, left), visits))
+        end = visits + max(1, simulations // (phases * remaining))
+        while visits < end and left:
+            times = max(1, min(visits // SHARE, leaves // remaining, left // remaining, end - visits))
+            for first in range(0, min(left, remaining * times), leaves):
+                rounds.append((min(leaves, remaining * times - first, left), visits, times))
                 left -= rounds[-1][0]
-            visits += 1
+            visits += times
         remaining = max(min(2, considered), remaining // 2)
     return rounds

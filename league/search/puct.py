@@ -12,13 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from league.policies.draws import Generators
-from league.search.rules import ILLEGAL, Node, Nodes, Score
+from league.search.rules import ILLEGAL, SHARE, Node, Nodes, Score
 
 EXPLORATION = 1.5
 """The constant c. Silver et al. let it grow from 1.25, by 0.04 in 800 simulations."""
-SHARE = 4
-"""A round has at most a SHARE-th of the simulations before it, or one: while a tree is small, each result changes where
-to look next."""
 
 
 class PUCT:

@@ -14,6 +14,10 @@ ILLEGAL = -1e9
 SCALE = 2.0**24
 """Scores are compared as integers, multiplied by this: equal ones stay equal when they are computed in another way."""
 
+SHARE = 4
+"""A round has at most a SHARE-th of the simulations before it, or one: while a tree is small, each result changes where
+to look next."""
+
 
 class Estimates(NamedTuple):
     """What is expected in k positions.

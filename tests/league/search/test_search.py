@@ -20,7 +20,7 @@ from league.policies.line_games.game import TIC_TAC_TOE
 from league.policies.line_games.solver import LineGameSolver
 from league.search.gumbel import SequentialHalving
 from league.search.puct import PUCT
-from league.search.rules import Estimates, Nodes, Rule
+from league.search.rules import SHARE, Estimates, Nodes, Rule
 from league.search.search import FEW_GAMES, LEAVES, Search, SearchResult
 from league.spaces import ACTION_MASK, OBSERVATION
 
@@ -179,15 +179,16 @@ class PlainNode:
         self.priors = dict(zip(self.legal, (shares / shares.sum()).tolist(), strict=True))
         self.returns: dict[int, list[float]] = {action: [] for action in self.legal}
 
-    def simulate(self, action: int) -> dict[int, float]:
-        if action in self.children:
-            child = self.children[action]
-            values = child.values if child.is_over else child.simulate(child.next_action())
-        else:
-            child = self.children[action] = PlainNode((*self.actions, action))
-            values = child.values
-        self.returns[action].append(values[self.player])
-        return values
+    def path(self, action: int, next_action: "NextAction", sent: Counter[tuple["PlainNode", int]]) -> "Path":
+        """Send a simulation from here, which is not evaluated yet."""
+        node, path = self, list[tuple[PlainNode, int]]()
+        while True:
+            path.append((node, action))
+            sent[node, action] += 1
+            if action not in node.children or node.children[action].is_over:
+                return path
+            node = node.children[action]
+            action = next_action(node, sent)
 
     def puct(self, sent: Counter[tuple["PlainNode", int]]) -> int:
         mean = (self.values[self.player] + sum(map(sum, self.returns.values()))) / (1 + self.count())
@@ -217,16 +218,33 @@ class PlainNode:
             action: math.log(self.priors[action]) + scale * (1 + mean.get(action, mixed)) / 2 for action in self.legal
         }
 
-    def next_action(self) -> int:
+    def next_action(self, sent: Counter[tuple["PlainNode", int]]) -> int:
         improved = self.improved()
         highest = max(improved.values())
         total = sum(math.exp(logit - highest) for logit in improved.values())
         return max(
             self.legal,
             key=lambda action: (
-                math.exp(improved[action] - highest) / total - len(self.returns[action]) / (1 + self.count())
+                math.exp(improved[action] - highest) / total
+                - (len(self.returns[action]) + sent[self, action]) / (1 + self.count())
             ),
         )
+
+
+Path = list[tuple[PlainNode, int]]
+NextAction = Callable[[PlainNode, Counter[tuple[PlainNode, int]]], int]
+
+
+def evaluate_all(paths: Sequence[Path]) -> None:
+    """Evaluate the ends of the paths of a round, and tell their nodes."""
+    for path in paths:
+        node, action = path[-1]
+        if action not in node.children:
+            node.children[action] = PlainNode((*node.actions, action))
+    for path in paths:
+        values = path[-1][0].children[path[-1][1]].values
+        for node, action in path:
+            node.returns[action].append(values[node.player])
 
 
 def plain_search(
@@ -241,14 +259,17 @@ def plain_search(
     remaining = sorted(root.legal, key=score, reverse=True)
     phases = math.ceil(math.log2(len(remaining)))
     while root.count() < simulations:
-        for _ in range(max(1, simulations // (phases * len(remaining)))):
-            # All of them once, the best ones first, in case that the simulations do not suffice.
+        end = len(root.returns[remaining[0]]) + max(1, simulations // (phases * len(remaining)))
+        while (visits := len(root.returns[remaining[0]])) < end and (left := simulations - root.count()):
+            # All of them equally often, the best ones first, in case that the simulations do not suffice.
+            times = min(visits // SHARE, leaves // len(remaining), left // len(remaining), end - visits)
             waiting = list(remaining)
             while waiting and (left := simulations - root.count()):
                 best = sorted(waiting, key=score, reverse=True)[: min(leaves, left)]
                 waiting = [action for action in waiting if action not in best]
-                for action in best:
-                    root.simulate(action)
+                sent = Counter[tuple[PlainNode, int]]()
+                numbered = product(range(max(1, times)), best)
+                evaluate_all([root.path(action, PlainNode.next_action, sent) for _, action in numbered])
         remaining = sorted(remaining, key=score, reverse=True)[: max(2, len(remaining) // 2)]
     visits = [len(root.returns.get(action, ())) for action in range(7)]
     most = [action for action in root.legal if visits[action] == max(visits)]
@@ -262,29 +283,11 @@ def test_puct_equals_a_plain_search(game: tuple[int, ...], simulations: int, lea
     root = PlainNode(game)
     sizes = PUCT().start(Nodes(*np.zeros((6, 1, 7), dtype=np.float32)), simulations, leaves, None)[0].tolist()
     for size in sizes:
-        sent: Counter[tuple[PlainNode, int]] = Counter()
-        paths = []
-        for _ in range(size):
-            node, path = root, list[tuple[PlainNode, int]]()
-            while not node.is_over:
-                action = node.puct(sent)
-                path.append((node, action))
-                sent[node, action] += 1
-                if action not in node.children:
-                    break
-                node = node.children[action]
-            paths.append(path)
-        for path in paths:
-            node, action = path[-1]
-            if action not in node.children:
-                node.children[action] = PlainNode((*node.actions, action))
-        for path in paths:
-            values = path[-1][0].children[path[-1][1]].values
-            for node, action in path:
-                node.returns[action].append(values[node.player])
+        sent = Counter[tuple[PlainNode, int]]()
+        evaluate_all([root.path(root.puct(sent), PlainNode.puct, sent) for _ in range(size)])
     result = searched(ConnectFour, [game], PUCT(), simulations, hashed, leaves=leaves)
     assert result.visits[0].tolist() == [len(root.returns.get(action, ())) for action in range(7)]
-    assert max(sizes) == min(leaves, simulations // 4)
+    assert max(sizes) == min(leaves, simulations // SHARE)
 
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
