@@ -15,12 +15,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean
 from typing import Annotated, Any
 
 import torch
 import typer
-from ray.rllib.utils.metrics import LEARNER_UPDATE_TIMER, TIMERS
 
 from benchmarks import phases
 from benchmarks.harness import CONFIGS, ROOT, Parts, Quick, Target, chosen, machine
@@ -281,30 +280,6 @@ def off_policy_targets(result: Result, _: Path) -> Iterator[Target]:
             yield Target(f"{config}, time with the GPU", rates[best] / gpu, "×", at_most=1.0, peer=best)
 
 
-def learners_rates(place: Machine, _: Path) -> dict[str, float]:
-    """Actions per second of the update alone, with learners of one thread that take turns."""
-    league = LeagueConfig.load(CONFIGS / "connect_four.yaml").with_training(runners=0, threads=1, **ALONE)
-    updates: dict[int, list[float]] = {1: [], 2: []}
-    with local_ray(cpus=3):
-        torch.set_num_threads(1)
-        algorithms = {
-            count: build_algorithm(league.with_training(learners=count), interface(league), runner_cpus=1.0)
-            for count in updates
-        }
-        for _ in range(1 + math.ceil(30 * place.scale)):
-            for count, algorithm in algorithms.items():
-                timers = algorithm.train()[TIMERS]
-                updates[count].append(league.training.train_batch_size / timers[LEARNER_UPDATE_TIMER])
-        for algorithm in algorithms.values():
-            algorithm.stop()
-    return {f"{count}": median(rates[1:]) for count, rates in updates.items()}
-
-
-def learners_targets(result: Result, _: Path) -> Iterator[Target]:
-    one, two = result.rates["1"], result.rates["2"]
-    yield Target("update with two learners", two / one, "×", at_least=1.6, peer="one", note=f"{one:,.0f} actions/s")
-
-
 def on_gpu(place: Machine) -> dict[str, Any]:
     """Settings of a learner on the GPU, if there is one."""
     return {"gpus": 1} if place.gpu else {}
@@ -318,7 +293,6 @@ PARTS: dict[str, tuple[Work, Targets]] = {
     "leduc": (leduc_jobs, leduc_targets),
     "pistonball": (pistonball_jobs, pistonball_targets),
     "off_policy": (off_policy_rates, off_policy_targets),
-    "learners": (learners_rates, learners_targets),
 }
 NEED_GPU = ("gpu", "strength", "pistonball", "off_policy")
 

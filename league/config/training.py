@@ -143,8 +143,8 @@ class TrainingSettings(Part):
     """Factor of `train_batch_size` and `minibatch_size`, with PPO; the learning rate grows with its square root. auto:
     1, or more for vectorised environments on a GPU or many cores."""
     learners: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
-    """Number of learning processes (learners), with PPO. Each has its share of every minibatch, and their gradients are
-    averaged. auto: 1, or more for minibatches of thousands of steps if cores are left."""
+    """Number of learning processes (learners), with PPO: several only on GPUs. Each has its share of every minibatch,
+    and their gradients are averaged. auto: 1."""
     threads: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Threads of each learner. auto: up to four, of the cores that the runners leave."""
     gamma: float = Field(default=0.99, ge=0, le=1)

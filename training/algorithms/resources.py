@@ -3,9 +3,8 @@
 With PPO, runners sample while the learner updates (`training.lag`). How many of the cores sample depends on what
 sampling costs in relation to learning: see SHARES. There are no more runners than leave each agent STEPS_PER_BATCH
 steps of each environment per batch. With small minibatches, a GPU or many cores are no faster than a few cores:
-batches are scaled. Several learners wait for each other at each gradient step: there is one, unless both a minibatch
-and the cores suffice for more. Off-policy algorithms sample in short rounds, in the learner's process; a stock
-environment has runners if each of them steps its environments at least once per round.
+batches are scaled. There is one learner. Off-policy algorithms sample in short rounds, in the learner's process; a
+stock environment has runners if each of them steps its environments at least once per round.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,9 +32,6 @@ FEWEST_STOCK_ENVS, FEWEST_VECTOR_ENVS = 2, 8
 """Minimum number of environments of a runner: with fewer, most of its time goes into forward passes of a few rows."""
 MAX_THREADS = 4
 """More do not accelerate networks of a few hundred units."""
-ROWS_PER_LEARNER = 2048
-"""Minimum part of a minibatch for which another learner is started. On two cores, two learners took 8 ms for a gradient
-step of 512 rows, and one 6 ms: they waited for about 5 ms. At this number, each computes several times as long."""
 SCALED_ROWS_PER_CORE, MOST_SCALED_ROWS, SCALED_ROWS_OF_GPU = 256, 4096, 8192
 """Steps of a scaled minibatch: for each core, at most in total, and on a GPU, where a gradient step of 512 rows takes
 as long as one of some thousands."""
@@ -123,24 +119,20 @@ def _choose(league: LeagueConfig, agents: int, nodes: Nodes) -> tuple[Resources,
     if batch_scale == AUTO:
         batch_scale = _batch_scale(settings, sampling, _cores(nodes), on_gpu=gpus > 0)
     settings = scaled(settings, batch_scale)
+    learners = 1 if settings.learners == AUTO else settings.learners
     runners, is_external = settings.runners, league.environment.external is not None
     if runners == AUTO and is_external:
         runners = int(_overlaps(settings) and _cores(nodes) > 1)
         reasons.append("one process serves all simulators")
     elif runners == AUTO:
-        runners, reason = _runners(settings, sampling, agents, _cores(nodes), on_gpu=gpus > 0)
+        runners, reason = _runners(settings, sampling, agents, _cores(nodes), learners if gpus else 0)
         reasons.append(reason)
     num_envs = settings.num_envs
     if num_envs == AUTO:
         num_envs = _num_envs(settings, "vectorised" if is_external else sampling, agents, runners)
-    samplers = runners if _overlaps(settings) else 0
-    learners = settings.learners
-    if learners == AUTO:
-        learners, reason = _learners(settings, nodes, samplers, on_gpu=gpus > 0)
-        reasons += [reason] if reason else []
     threads = settings.threads
     if threads == AUTO:
-        threads = _threads(nodes, samplers, learners)
+        threads = _threads(nodes, runners if _overlaps(settings) else 0, learners)
     return Resources(runners, num_envs, threads, gpus, settings.runner_gpus, learners, batch_scale), reasons
 
 
@@ -185,9 +177,9 @@ def _batch_scale(settings: TrainingSettings, sampling: Sampling, cores: int, *, 
 
 
 def _runners(
-    settings: TrainingSettings, sampling: Sampling, agents: int, cores: int, *, on_gpu: bool
+    settings: TrainingSettings, sampling: Sampling, agents: int, cores: int, gpu_learners: int
 ) -> tuple[int, str]:
-    """Return the number of runners, and why."""
+    """Return the number of runners, and why. gpu_learners: the learners on GPUs, of which each needs a core."""
     if cores == 1:
         return 0, "one core samples and learns in turn"
     if isinstance(settings, OffPolicyConfig):
@@ -201,9 +193,8 @@ def _runners(
         if sampling == "vectorised":
             return 0, "without a lag, sampling a vectorised environment is too short for runners"
         runners, reason = cores, "without a lag, all cores sample, then learn"
-    elif on_gpu:
-        learners = 1 if settings.learners == AUTO else settings.learners
-        runners, reason = max(1, cores - learners), "the learner is on the GPU: all other cores sample"
+    elif gpu_learners:
+        runners, reason = max(1, cores - gpu_learners), "the learner is on the GPU: all other cores sample"
     else:
         share, reason = SHARES[sampling]
         runners = max(1, round(cores * share))
@@ -212,20 +203,6 @@ def _runners(
     if runners <= most:
         return runners, reason
     return most, f"more runners would get batches of less than {STEPS_PER_BATCH} steps of {fewest} environments"
-
-
-def _learners(settings: TrainingSettings, nodes: Nodes, samplers: int, *, on_gpu: bool) -> tuple[int, str]:
-    """Return the number of learners, and why, if cores are left for several. samplers: see `_threads`."""
-    if not isinstance(settings, PPOConfig) or on_gpu:
-        return 1, ""
-    threads = _threads(nodes, samplers, 1) if settings.threads == AUTO else settings.threads
-    fitting = (_cores(nodes) - samplers) // threads
-    if fitting < 2:
-        return 1, ""
-    learners = max(1, min(fitting, settings.minibatch_size // ROWS_PER_LEARNER))
-    if learners == 1:
-        return 1, f"minibatches of less than {2 * ROWS_PER_LEARNER} rows are too short for several learners"
-    return learners, f"each learner has at least {ROWS_PER_LEARNER} rows of a minibatch"
 
 
 def _threads(nodes: Nodes, samplers: int, learners: int) -> int:

@@ -141,6 +141,9 @@ def train(
     with connected(address, registry.storage, local) as dashboard:
         if is_own():
             use_waiting_workers()
+        settings, nodes = config if earlier is None else earlier.record.config, node_resources()
+        used = resources(settings, len(interface.agents), nodes)
+        placement(used, cpu_share(used.processes))  # raises before the run begins
         run = earlier or RunDirectory.begin(
             registry.storage,
             config,
@@ -151,8 +154,7 @@ def train(
             name,
             0 if start is None else start.steps,
         )
-        choice = describe(run.record.config, len(interface.agents), nodes := node_resources())
-        run.use(resources(run.record.config, len(interface.agents), nodes))
+        run.use(used)
         progress = TrainingProgress(console or Console(), run.record.config.training, interface.policies)
         callbacks = Callbacks(run.record.config.training.callbacks, interface)
         with (
@@ -162,7 +164,7 @@ def train(
             StrengthQueue(run, registry, progress, trackers.measuring(measure)) as strength,
         ):
             with RunReporter(registry, run) as reporter:
-                _describe(config, interface, run, choice, dashboard, progress)
+                _describe(config, interface, run, describe(settings, len(interface.agents), nodes), dashboard, progress)
                 RunDriver(run, registry, interface, progress, reporter, strength, callbacks, trackers).train()
             strength.join()
     return published_versions(registry, run)

@@ -41,18 +41,19 @@ def cpu_share(processes: int, at_once: int = 1) -> float:
 def placement(used: Resources, cpus: float) -> tune.PlacementGroupFactory:
     """Place each learner and runner on any node that has what they need.
 
-    cpus: of each. Raises ConfigError if there are more learners than CPUs, or if no nodes have what is needed, which
-    Ray would wait for forever, unless its autoscaler adds nodes.
+    cpus: of each. Raises ConfigError for several learners without GPUs, or if no nodes have what is needed, which Ray
+    would wait for forever, unless its autoscaler adds nodes.
     """
+    if used.learners > 1 and not used.gpus:
+        raise ConfigError(
+            f"training.learners: expected 1, because the learner has no GPU (training.gpus is 0), got {used.learners}:"
+            " on CPUs, several learners are slower than one"
+        )
     gpus = used.gpus + (used.runner_gpus if used.runners == 0 else 0)
     first, further, runner = ({"CPU": cpus} | _gpus(count) for count in (gpus, used.gpus, used.runner_gpus))
     learners = [first] + [further] * (used.learners - 1)
     if not has_autoscaler():
         total = {name: sum(node.get(name, 0.0) for node in node_resources()) for name in ("CPU", "GPU")}
-        if used.learners > max(1, total["CPU"]):
-            raise ConfigError(
-                f"training.learners: expected at most one per CPU, got {used.learners} for {total['CPU']:g} CPUs"
-            )
         if (requested := requested_gpus(used)) > total["GPU"]:
             names = "training.gpus, training.runner_gpus" if used.learners == 1 else "training.learners with gpus"
             raise ConfigError(f"{names}: {requested:g} GPUs requested in total, but Ray has {total['GPU']:g}")

@@ -21,12 +21,16 @@ from league.config.schedules import ScheduleProgress
 from league.environments.building import interface
 from league.errors import ConfigError
 from tests.support.algorithms import running
+from tests.support.closeness import close
 from tests.support.environments.training_environments import ROUNDS
 from tests.support.leagues.training_leagues import counting, solvable, tictactoe
+from tests.support.learners import equal, weights
 from tests.support.waiting import until
 from training.algorithms.ppo import PPO
 from training.algorithms.rllib_config import algorithm_config, module_spec
 from training.learners.ppo import TEACHER_LOSS, TEACHER_WEIGHT
+from training.rllib_compat import local_learner
+from training.runs.error_messages import is_process_lost
 from training.sampling.env_runner import module_spaces
 from training.sampling.episode_chunks import EpisodeChunks
 
@@ -113,6 +117,29 @@ def test_a_runner_lost_before_a_checkpoint_ends_training() -> None:
         until(lambda: is_lost(runner))  # it may answer for a moment
         with pytest.raises(RayActorError):
             algorithm.reset_episodes(64)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+def test_a_further_learner_repeats_updates_and_a_lost_one_ends_training() -> None:
+    """Their processes, on CPUs, where `league train` refuses several learners."""
+    league = tictactoe(runners=0, **SMALL | {"train_batch_size": 256})
+    with running(league) as alone:
+        alone.train()
+        expected = weights(local_learner(alone))
+    with running(league.with_training(learners=2)) as algorithm:
+        before = weights(first := local_learner(algorithm))
+        algorithm.train()
+        assert close(weights(first)["shared"], expected["shared"], 1e-3)
+        assert not close(weights(first)["shared"], before["shared"], 1e-3)
+        algorithm.train()
+        (repeated,) = algorithm.further_learners.apply(lambda further: weights(further._learner))
+        assert equal(repeated, weights(first))
+        (process,) = algorithm.further_learners._actors
+        ray.kill(process)
+        with pytest.raises(RayActorError) as lost:
+            algorithm.train()
+        assert is_process_lost(lost.value)
 
 
 class Recording(PPO):

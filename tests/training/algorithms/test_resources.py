@@ -14,7 +14,6 @@ from training.algorithms.resources import (
     FEWEST_STOCK_ENVS,
     FEWEST_VECTOR_ENVS,
     MAX_THREADS,
-    ROWS_PER_LEARNER,
     STEPS_PER_BATCH,
     Nodes,
     describe,
@@ -40,26 +39,25 @@ def stock(**training: Any) -> LeagueConfig:
 
 
 def test_learners_divide_the_cores_that_runners_leave() -> None:
-    assert [resources(vectorised(learners=learners), 2, machine(8)).threads for learners in (1, 2, 4)] == [4, 3, 1]
-    assert "2 learners of 3 threads" in describe(vectorised(learners=2), 2, machine(8))
+    several = [vectorised(learners=learners, gpus=1, runners=1) for learners in (1, 2, 4)]
+    assert [resources(league, 2, machine(8, 4)).threads for league in several] == [4, 3, 1]
+    assert "2 learners of 3 threads and 1 GPU" in describe(several[1], 2, machine(8, 4))
 
 
-def test_there_are_several_learners_only_for_large_minibatches_and_spare_cores(subtests: pytest.Subtests) -> None:
-    rows: list[tuple[dict[str, Any], Nodes, int]] = [
-        ({"minibatch_size": 2 * ROWS_PER_LEARNER}, machine(16), 2),
-        ({"minibatch_size": 2 * ROWS_PER_LEARNER - 1}, machine(16), 1),
-        ({"minibatch_size": 8 * ROWS_PER_LEARNER}, machine(16), 3),
-        ({"minibatch_size": 8 * ROWS_PER_LEARNER, "threads": 2}, machine(16), 7),
-        ({"minibatch_size": 8 * ROWS_PER_LEARNER}, machine(4), 1),
-        ({"minibatch_size": 8 * ROWS_PER_LEARNER, "hidden": [1024]}, machine(16, 2), 1),
-        ({"algorithm": "dqn"}, machine(16), 1),
+def test_one_learner_is_chosen_on_any_machine(subtests: pytest.Subtests) -> None:
+    rows: list[tuple[dict[str, Any], Nodes]] = [
+        ({"minibatch_size": 4096}, machine(64)),
+        ({"minibatch_size": 4096, "hidden": [1024]}, machine(64, 8)),
+        ({"algorithm": "dqn"}, machine(64)),
     ]
-    for training, nodes, expected in rows:
-        batch = {} if "algorithm" in training else {"train_batch_size": 2**17}
-        league = vectorised(**batch | training)
-        with subtests.test(str(training), nodes=nodes):
-            assert resources(league, 2, nodes).learners == expected
-            assert ("rows" in describe(league, 2, nodes)) == (nodes == machine(16) and "algorithm" not in training)
+    for training, nodes in rows:
+        with subtests.test(str(training)):
+            assert resources(vectorised(**training), 2, nodes).learners == 1
+
+
+def test_learners_on_gpus_have_cores_that_do_not_sample() -> None:
+    rows = [vectorised(learners=learners, gpus=1, train_batch_size=2**17) for learners in (1, 3)]
+    assert [resources(league, 2, machine(16, 4)).runners for league in rows] == [15, 13]
 
 
 def test_batches_grow_with_the_machine(subtests: pytest.Subtests) -> None:

@@ -29,6 +29,7 @@ from league.settings import Storage
 from tests.support.leagues.training_leagues import tictactoe
 from tests.support.waiting import until
 from training.export import publish as publishing
+from training.runs.run_directory import RunDirectory
 from training.runs.train import train
 from training.runs.tune import Interrupted
 
@@ -232,6 +233,19 @@ def test_invalid_options_are_rejected_before_training(registry: Registry) -> Non
     assert not (registry.storage.home / "runs").exists()
 
 
+@pytest.mark.usefixtures("ray_session")
+def test_what_the_machine_lacks_is_refused_before_a_run_begins(registry: Registry) -> None:
+    with pytest.raises(ConfigError, match="1 GPUs requested in total, but Ray has 0"):
+        train(tictactoe(gpus=1), registry=registry)
+    with pytest.raises(ConfigError, match=r"training\.learners: expected 1, .* \(training\.gpus is 0\), got 2"):
+        train(tictactoe(learners=2), registry=registry)
+    assert not (registry.storage.home / "runs").exists()
+    run = RunDirectory.begin(registry.storage, tictactoe(learners=2), None, None)
+    with pytest.raises(ConfigError, match=r"training\.learners: expected 1"):
+        train(tictactoe(), registry=registry, resume=True)
+    assert not run.attempts()
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("ray_session")
 def test_a_failed_parity_check_ends_the_run_and_keeps_earlier_versions(
@@ -349,21 +363,15 @@ def test_a_killed_run_publishes_the_same_versions_after_resuming(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("process", "settings"),
-    [("FurtherLearner", LOCAL | {"learners": 2, "epochs": 8}), ("BatchedEnvRunner", {"epochs": 64})],
-)
-def test_a_lost_process_is_replaced(
-    ray_session: None, registry: Registry, process: str, settings: dict[str, int]
-) -> None:
+def test_a_lost_process_is_replaced(ray_session: None, registry: Registry) -> None:
     """A run continues from its newest version."""
-    league = tictactoe(steps=2560, **SETTINGS | {"minibatch_size": 32} | settings)
+    league = tictactoe(steps=2560, **SETTINGS | {"minibatch_size": 32, "epochs": 64})
     home = registry.storage.home
 
     def kill() -> None:
         until(lambda: any(home.glob("runs/tictactoe/*/attempt-1/checkpoints/512")), DEADLINE)
         workers = psutil.Process().children(recursive=True)
-        next(worker for worker in workers if process in "".join(worker.cmdline())).kill()
+        next(worker for worker in workers if "BatchedEnvRunner" in "".join(worker.cmdline())).kill()
 
     output, killer = io.StringIO(), threading.Thread(target=kill)
     killer.start()
