@@ -173,8 +173,8 @@ def value_graphs(version: VersionRow) -> dict[str, str]:
     graphs = {policy: file for policy, file in files.items() if file is not None}
     if len(graphs) < len(files):
         raise InvalidInput(
-            f"{version.ref} has no value graph, which a search needs. PPO with `critic: own` and without recurrence"
-            f" exports one: `league train CONFIG --from {version.ref}` publishes versions that have it"
+            f"{version.ref} has no value graph, which a search needs. PPO, and what is derived from it, exports one"
+            " with `critic: own` and without recurrence"
         )
     return graphs
 

@@ -65,10 +65,19 @@ def publish_short_training(registry: Registry, config: LeagueConfig, path: Path)
 
 
 @pytest.mark.usefixtures("ray_session")
-@pytest.mark.parametrize("name", LEAGUES)
-def test_an_example_trains_and_its_version_plays(name: str, registry: Registry, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        *((name, {}) for name in LEAGUES),
+        ("connect_four_residual", {"recurrence": {"width": 4, "sequence": 4}}),
+        ("tictactoe_separate_critic", {"recurrence": {"width": 4, "sequence": 4}}),
+    ],
+)
+def test_an_example_trains_and_its_version_plays(
+    name: str, settings: dict[str, Any], registry: Registry, tmp_path: Path
+) -> None:
     document: dict[str, Any] = LEAGUES[name]
-    short = SHORT_OFF_POLICY if name == "tictactoe_sac" else SHORT
+    short = settings | (SHORT_OFF_POLICY if name == "tictactoe_sac" else SHORT)
     config = with_algorithm(LeagueConfig.from_mapping(document | {"training": document["training"] | short}))
     check(config, interface(config))
     publish_short_training(registry, config, tmp_path / "64")

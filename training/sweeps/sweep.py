@@ -18,6 +18,7 @@ from ray.tune.schedulers import ASHAScheduler, FIFOScheduler, TrialScheduler
 from rich.console import Console
 
 from league.config.league import LeagueConfig
+from league.config.marwil import MARWILConfig
 from league.config.sweep import SweepConfig
 from league.environments.building import interface as interface_of
 from league.errors import ConfigError, LeagueError
@@ -228,6 +229,8 @@ def _check(
     config: LeagueConfig, sweep: SweepConfig, leagues: Sequence[LeagueConfig], interface: Interface, can_play: bool
 ) -> None:
     names = metrics.metric_names(interface, algorithm_class(config.training.algorithm).curves) | {STRENGTH}
+    if isinstance(config.training, MARWILConfig):  # it plays no episodes
+        names -= metrics.metric_names(interface, ())
     if sweep.metric not in names:
         raise ConfigError(f"sweep.metric: unknown metric {sweep.metric!r}; expected one of {', '.join(sorted(names))}")
     if sweep.metric == STRENGTH and not can_play:

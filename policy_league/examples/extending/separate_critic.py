@@ -12,7 +12,7 @@ from training.modules.recurrent import State
 
 
 class SeparateCritic(ActorCritic):
-    """An actor and a critic without common layers. Not recurrent."""
+    """An actor and a critic without common layers. With `recurrence`, only the actor has a memory."""
 
     def setup(self) -> None:
         super().setup()
@@ -34,8 +34,8 @@ class SeparateCritic(ActorCritic):
         return self.value_head(self.critic(batch[Columns.OBS])).squeeze(-1)
 
     def value_step(self, batch: dict[str, Any]) -> tuple[Tensor, State]:
-        """Return values, (B,), and no state."""
-        return self.compute_values(batch), {}
+        """Return values, (B,), and the state as it was, which they do not depend on."""
+        return self.compute_values(batch), batch.get(Columns.STATE_IN, {})
 
 
 class SeparatePPO(PPO):

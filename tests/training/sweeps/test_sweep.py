@@ -11,6 +11,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -52,6 +54,14 @@ def test_invalid_sweeps_are_rejected_before_training(registry: Registry) -> None
         ),
         r"sweep\.asha\.grace_steps": league({"lr": [1]}, metric="return", asha={"grace_steps": 10**6}),
         r"sweep\.metric: strength is measured by games, for which": league({"lr": [1]}),
+    }
+    imitation = {"algorithm": "marwil", "data": str(registry.storage.home), "epochs": 1, "strength": None}
+    imitating(registry.storage.home)
+    rejected |= {
+        r"search\.simulations 4: .*training\.search: unknown key": league({"search.simulations": [4]}),
+        r"sweep\.metric: unknown metric 'return'; expected one of shared/": league(
+            {"lr": [1]}, training=imitation, metric="return"
+        ),
     }
     for words, config in rejected.items():
         with pytest.raises(ConfigError, match=words):
@@ -127,6 +137,45 @@ def untrained_champion(registry: Registry) -> str:
     (version,) = train(tictactoe(**settings), registry=registry, console=Console(quiet=True))
     registry.aliases.set("tictactoe", "champion", version.number, expected=None, actor="test", reason="first")
     return version.ref
+
+
+def imitating(directory: Path) -> dict[str, Any]:
+    """Settings for learning from a recorded game of one move."""
+    row = {"match": "1", "game": 0, "agent": "player_1", "step": 0, "action": 4, "reward": 1.0, "terminated": True}
+    row |= {"observation": [0] * 18, "action_mask": [1] * 9}
+    pq.write_table(pa.Table.from_pylist([row]), directory / "shared.parquet")
+    return {"algorithm": "marwil", "data": str(directory)}
+
+
+SEPARATE = {"algorithm": "policy_league.examples.extending.separate_critic:SeparatePPO"}
+SAC = {"algorithm": "policy_league.examples.extending.sac:SAC", "learning_starts": 64, "batch_size": 32}
+RESIDUAL = {"entry_point": "policy_league.examples.extending.residual:Residual", "kwargs": {"blocks": 1, "channels": 2}}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize(
+    ("training", "parameters"),
+    [
+        ({"network": RESIDUAL}, {"network.kwargs.channels": [2, 4]}),
+        (SEPARATE, {"lr": [0.001, 0.01]}),
+        (SAC, {"temperature": [0.01, 0.1]}),
+        ({}, {"critic": ["own", "central"], "normalize_values": [True]}),
+        (imitating, {"beta": [0.0, 1.0]}),
+    ],
+    ids=["network", "PPO of one's own", "off-policy of one's own", "MAPPO", "MARWIL"],
+)
+def test_what_extends_training_is_swept(training: Any, parameters: dict[str, Any], registry: Registry) -> None:
+    training = imitating(registry.storage.home) if callable(training) else training
+    on_policy = {"train_batch_size": 64, "minibatch_size": 64} if training is not SAC else {}
+    settings = {"runners": 0, "num_envs": 4, "steps": 256, "strength": {"games": 4}} | on_policy | training
+    document: dict[str, Any] = {"environment": {"entry_point": "pettingzoo.classic.tictactoe_v3"}, "league": "swept"}
+    document |= {"training": settings, "sweep": {"parameters": parameters}}
+    config = LeagueConfig.from_mapping(document)
+    report = sweep(config, registry=registry, console=Console(quiet=True), open_games=StrengthProcess)
+    assert [trial.error for trial in report.trials] == [None, None]
+    assert all(trial.score is not None for trial in report.trials)
+    assert report.version is not None
 
 
 SCRIPT = """
