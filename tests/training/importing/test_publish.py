@@ -8,19 +8,22 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from rich.console import Console
 from scipy.special import softmax
 
 from evaluation.matches.tournament import evaluate
-from league.errors import ConfigError, EnvironmentMismatch, ParityError
+from league.errors import ConfigError, EnvironmentMismatch, InvalidInput, ParityError
 from league.policies import load
 from league.registry.registry import Registry
 from league.registry.storage.rows import VersionRow
+from league.search.policies import publish_search
 from tests.support.leagues import tictactoe
 from tests.support.policies.foreign_graphs import foreign, influenced, recurrent
 from training.importing import checks
 from training.importing.open_source import open_sources
 from training.importing.publish import publish
 from training.runs.parent import check_network
+from training.runs.train import train
 
 
 @pytest.fixture(autouse=True)
@@ -70,8 +73,43 @@ def test_an_imported_graph_is_a_version_like_others(registry: Registry, tmp_path
 
 
 def test_training_cannot_start_from_an_imported_version(registry: Registry, tmp_path: Path) -> None:
+    version, league = imported(registry, graph(tmp_path)), registry.leagues.get(tictactoe.LEAGUE)
     with pytest.raises(ConfigError, match=r"tictactoe@1 was imported: it has no training state"):
-        check_network(imported(registry, graph(tmp_path)), tictactoe.config())
+        check_network(version, tictactoe.config())
+    with pytest.raises(InvalidInput, match=r"tictactoe@1 has no value graph, which a search needs\."):
+        publish_search(registry, version, league.config.environment, league.interface, "puct", 4)
+
+
+EXTENDING = "policy_league.examples.extending"
+SHORT = {"runners": 1, "num_envs": 4, "steps": 128, "strength": None}
+PPO = {"train_batch_size": 64, "minibatch_size": 64}
+SAC = {"learning_starts": 64, "batch_size": 32}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize(
+    "training",
+    [
+        PPO | {"network": {"entry_point": f"{EXTENDING}.residual:Residual", "kwargs": {"blocks": 1, "channels": 2}}},
+        PPO | {"algorithm": f"{EXTENDING}.separate_critic:SeparatePPO"},
+        SAC | {"algorithm": f"{EXTENDING}.sac:SAC"},
+        PPO | {"critic": "central"},
+    ],
+    ids=["network", "PPO of one's own", "off-policy of one's own", "MAPPO"],
+)
+def test_what_extends_training_plays_against_an_imported_version(
+    training: dict[str, Any], registry: Registry, tmp_path: Path
+) -> None:
+    imported(registry, graph(tmp_path))
+    (version,) = train(
+        tictactoe.config(training=SHORT | training | {"opponents": [{"ref": "@1", "share": 1.0}]}),
+        registry=registry,
+        console=Console(quiet=True),
+    )
+    (run,) = registry.runs.newest(tictactoe.LEAGUE)
+    assert "opponents/tictactoe@1/score" in registry.runs.get(tictactoe.LEAGUE, run.id).curves
+    assert version.number == 2
 
 
 def test_weights_in_another_file_are_included(registry: Registry, tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import math
+import re
 import shutil
 from contextlib import closing
 from dataclasses import replace
@@ -60,6 +61,22 @@ def test_an_exception_of_the_start_is_raised_by_the_first_step(tmp_path: Path) -
         failed.step()
     failed.cleanup()
     assert engines.RUNNING == []
+
+
+@pytest.mark.usefixtures("ray_session")
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"network": {"entry_point": "lost:Net"}, "hidden": [256, 256]}, "training.network: cannot import 'lost': "),
+        ({"algorithm": "lost:Algorithm"}, "training.algorithm: cannot import 'lost': "),
+        ({"algorithm": "marwil", "data": "/lost"}, "training.data: /lost/shared.parquet does not exist: "),
+    ],
+)
+def test_what_the_node_of_a_trial_lacks_is_named(tmp_path: Path, settings: dict[str, Any], message: str) -> None:
+    failed = trial(tmp_path, **settings)
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}.*$"):
+        failed.step()
+    failed.cleanup()
 
 
 def run(trial: Trial) -> list[dict[str, Any]]:
