@@ -13,7 +13,7 @@ from league.environments.stepping import BatchedEnvironment
 from league.errors import LeagueError
 from league.registry.gateways import ForSimulators
 from league.registry.registry import Registry
-from league.registry.storage.rows import Gateway
+from league.registry.storage.rows import Gateway, Purpose
 from league.settings import Storage
 from policy_league_client.simulator import PettingZooGame, SimulatedGame, simulate
 from tests.support.waiting import until
@@ -32,10 +32,10 @@ def external(stock: LeagueConfig, **parts: Any) -> LeagueConfig:
     return LeagueConfig.from_mapping(document | {"league": LEAGUE, "environment": {"external": section}} | parts)
 
 
-def stepping(registry: Registry, num_envs: int = 8) -> BatchedEnvironment:
-    """Environments of the league, for an evaluation."""
+def stepping(registry: Registry, num_envs: int = 8, purpose: Purpose = "evaluation") -> BatchedEnvironment:
+    """Environments of the league."""
     config = registry.leagues.get(LEAGUE).config
-    return stock_stepping(config.environment, num_envs, simulators=ForSimulators(registry.storage, LEAGUE))
+    return stock_stepping(config.environment, num_envs, simulators=ForSimulators(registry.storage, LEAGUE, purpose))
 
 
 def registry(home: Path, config: LeagueConfig) -> Registry:

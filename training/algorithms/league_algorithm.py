@@ -32,6 +32,10 @@ SHARE = "share"
 """Metric of an opponent: its share of the recent episodes."""
 
 
+class NoSimulator(Exception):
+    """`train` cannot continue: no simulator is connected to a runner. What was played belongs to the next update."""
+
+
 class LeagueAlgorithm(NoResultsDirectory, Algorithm):
     """An RLlib Algorithm whose runners play opponents from the league."""
 

@@ -38,7 +38,7 @@ from league.interface import Interface
 from league.random.seeds import derive
 from league.settings import Storage
 from training.algorithms import rllib_config
-from training.algorithms.league_algorithm import LeagueAlgorithm
+from training.algorithms.league_algorithm import LeagueAlgorithm, NoSimulator
 from training.algorithms.metrics import EXPLORATION, OFF_POLICY_METRICS
 from training.algorithms.rllib_config import ImportingConfig, configure, encoder_settings, rl_module_specs
 from training.learners.off_policy import OffPolicyLearner
@@ -100,20 +100,27 @@ class OffPolicy(LeagueAlgorithm):
         return self.settings.exploration.at(self.steps)
 
     def training_step(self) -> None:
-        """Sample and learn in rounds until ITERATION_STEPS actions were taken, and log metrics."""
+        """Sample and learn in rounds until ITERATION_STEPS actions were taken, and log metrics.
+
+        Ends earlier if no simulator is connected any more. Raises NoSimulator if there was none for a single action.
+        """
         seconds = dict.fromkeys((self.sampling_timer, LEARNER_UPDATE_TIMER, SYNCH_WORKER_WEIGHTS_TIMER), 0.0)
         learning = rllib_config.learning_policies(self.settings, tuple(self.config.policies), self.iteration)
         before = self.steps
         target = before + ITERATION_STEPS
-        while self.steps < target:
-            for timer, part in (
-                (self.sampling_timer, self._sample),
-                (LEARNER_UPDATE_TIMER, partial(self._learn, learning)),
-                (SYNCH_WORKER_WEIGHTS_TIMER, self._sync_weights),
-            ):
-                began = time.perf_counter()
-                part()
-                seconds[timer] += time.perf_counter() - began
+        try:
+            while self.steps < target:
+                for timer, part in (
+                    (self.sampling_timer, self._sample),
+                    (LEARNER_UPDATE_TIMER, partial(self._learn, learning)),
+                    (SYNCH_WORKER_WEIGHTS_TIMER, self._sync_weights),
+                ):
+                    began = time.perf_counter()
+                    part()
+                    seconds[timer] += time.perf_counter() - began
+        except NoSimulator:
+            if self.steps == before:
+                raise
         for timer, value in seconds.items():
             self.metrics.log_value((TIMERS, timer), value, window=1)
         self.metrics.log_value(EXPLORATION, self.exploration, window=1)
@@ -172,8 +179,8 @@ class OffPolicy(LeagueAlgorithm):
         return local_learner(self)
 
     def _sample(self) -> None:
-        """Sample one round from all runners into the buffers."""
-        group = self.env_runner_group
+        """Sample one round from all runners into the buffers. Raises NoSimulator if they took no action."""
+        before, group = self.steps, self.env_runner_group
         remote = group.num_remote_env_runners()
         play = partial(
             ReplayRunner.transitions,
@@ -185,6 +192,8 @@ class OffPolicy(LeagueAlgorithm):
             self.steps += actions
             for key, block in blocks.items():
                 self.replays[key].add(block)
+        if self.steps == before:
+            raise NoSimulator
 
     def _learn(self, learning: Collection[str]) -> None:
         """Run a round of gradient steps on the buffers that hold enough transitions."""

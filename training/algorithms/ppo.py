@@ -38,7 +38,7 @@ from league.settings import Storage
 from league.spaces import ACTION_MASK, inputs
 from training.algorithms import rllib_config
 from training.algorithms.further_learners import FurtherLearners
-from training.algorithms.league_algorithm import LeagueAlgorithm
+from training.algorithms.league_algorithm import LeagueAlgorithm, NoSimulator
 from training.algorithms.metrics import PPO_METRICS
 from training.algorithms.resources import resources, scaled
 from training.algorithms.rllib_config import ImportingConfig, configure, encoder_settings, rl_module_specs
@@ -68,6 +68,8 @@ class PPO(LeagueAlgorithm, ppo.PPO):
     curves = PPO_METRICS
     _requested = _received = 0
     """Numbers of samples of remote runners. The samples between them are in flight."""
+    _samples: tuple[Sample, ...] = ()
+    """Of some runners, while others had no simulator."""
 
     @classmethod
     def algorithm_config(cls, league: LeagueConfig, interface: Interface, storage: Storage | None) -> ppo.PPOConfig:
@@ -169,28 +171,33 @@ class PPO(LeagueAlgorithm, ppo.PPO):
 
         First requests samples from remote runners until `lag` further ones are in flight. A runner answers requests and
         receives weights in the order in which they were sent. Waits for all runners, however long they take. Raises
-        RayActorError if one is lost.
+        RayActorError if one is lost, and NoSimulator.
         """
         settings = self._settings
         is_taught = settings.teacher is not None and scheduled_value(settings.teacher.weight, self.progress) > 0
 
-        def sample(ahead: int) -> Callable[[BatchedEnvRunner], Sample]:
+        def sample(ahead: int) -> Callable[[BatchedEnvRunner], Sample | None]:
             taught = self._learning_policies(ahead) if is_taught else ()
             return partial(_sample_chunks, opponents=self.opponents.active, taught=taught)
 
-        if self.env_runner_group.num_remote_env_runners() == 0:
+        if not (runners := self.env_runner_group.num_remote_env_runners()):
             samples = self.env_runner_group.foreach_env_runner(sample(0))
         else:
             while (ahead := self._requested - self._received) <= settings.lag:
                 self.env_runner_group.foreach_env_runner_async(sample(ahead), tag=f"sample {self._requested}")
                 self._requested += 1
             samples = self._receive_sample()
-        return [part for chunks, _ in samples for part in chunks], [metrics for _, metrics in samples]
+        self._samples += tuple(part for part in samples if part is not None)
+        if len(self._samples) < max(runners, 1):
+            raise NoSimulator
+        complete, self._samples = self._samples, ()
+        return [part for chunks, _ in complete for part in chunks], [metrics for _, metrics in complete]
 
     def reset_episodes(self, steps: int) -> None:
         """See `LeagueAlgorithm.reset_episodes`. Drops the samples in flight, which no metric contains."""
         while self._received < self._requested:
             self._receive_sample()
+        self._samples = ()
         super().reset_episodes(steps)
 
     @property
@@ -203,15 +210,17 @@ class PPO(LeagueAlgorithm, ppo.PPO):
         """Return the policies to update after `ahead` further updates."""
         return rllib_config.learning_policies(self._settings, tuple(self.config.policies), self.iteration + ahead)
 
-    def _receive_sample(self) -> list[Sample]:
+    def _receive_sample(self) -> list[Sample | None]:
         tag = f"sample {self._received}"
         self._received += 1
         samples = self.env_runner_group.fetch_ready_async_reqs(tags=tag, timeout_seconds=None)
         return [sample for _, sample in samples]
 
 
-def _sample_chunks(runner: BatchedEnvRunner, opponents: Sequence[OpponentConfig], taught: Collection[str]) -> Sample:
+def _sample_chunks(
+    runner: BatchedEnvRunner, opponents: Sequence[OpponentConfig], taught: Collection[str]
+) -> Sample | None:
     with runner.timed_sample():
         runner.exchange_opponents(opponents)
         chunks = runner.sample_chunks(taught=taught)
-    return chunks, runner.get_metrics()
+    return (chunks, runner.get_metrics()) if chunks else None

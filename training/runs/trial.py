@@ -7,6 +7,7 @@ on the machine's speed.
 """
 
 import json
+import logging
 import math
 import time
 from collections import Counter
@@ -27,6 +28,7 @@ from league.errors import StorageError
 from league.interface import Interface
 from league.registry.registry import Registry
 from league.settings import Storage
+from training.algorithms.league_algorithm import NoSimulator
 from training.algorithms.metrics import (
     CHECKPOINT_TIME,
     OTHER_TIME,
@@ -43,6 +45,8 @@ from training.rllib_compat import wait_for_runners
 from training.runs.checkpoint_digests import write_digests
 from training.runs.driver_files import DriverFiles, DriverMachine
 from training.sampling.play_metrics import PlayedEpisodes
+
+logger = logging.getLogger(__name__)
 
 REPORT_SECONDS = 2.0
 """Interval between a trial's reports, in seconds."""
@@ -120,6 +124,7 @@ class Trial(tune.Trainable):
         self.registry = Registry.open(self.plan.storage, create=False) if is_external else None
         if self.registry is not None:
             self._opened.callback(self.registry.close)
+        self._is_waiting = False
         start = self.plan.start
         checkpoint = None if start.checkpoint is None else self.files.fetch(start.checkpoint)
         self.algorithm = build_algorithm(self.league, self.interface, checkpoint, self.plan.cpus, self.plan.storage)
@@ -155,8 +160,12 @@ class Trial(tune.Trainable):
                 continue
             self.algorithm.progress = ScheduleProgress(self.steps, self._budget_spent())
             updated = time.monotonic()
-            result = self.algorithm.train()
-            self.seconds += time.monotonic() - updated
+            try:
+                result = self.algorithm.train()
+            except NoSimulator:
+                continue
+            finally:
+                self.seconds += time.monotonic() - updated
             self.steps += int(result[ENV_RUNNER_RESULTS][NUM_ENV_STEPS_SAMPLED])
             update = (
                 training_metrics(result, self.interface, self.algorithm.curves) | self.algorithm.curriculum.metrics()
@@ -222,12 +231,16 @@ class Trial(tune.Trainable):
 
     def _has_simulators(self, registry: Registry) -> bool:
         """Whether simulators are connected. Waiting for them is no part of the run's minutes."""
+        has_some = False
         with suppress(StorageError):
             gateways = registry.gateways.open(self.league.league)
-            if any(gateway.simulators and not gateway.is_evaluation for gateway in gateways):
-                return True
-        time.sleep(SIMULATOR_CHECK)
-        return False
+            has_some = any(gateway.simulators and not gateway.is_evaluation for gateway in gateways)
+        if self._is_waiting == has_some:
+            logger.warning("%s", "A simulator is connected." if has_some else "No simulator is connected: waiting.")
+            self._is_waiting = not has_some
+        if not has_some:
+            time.sleep(SIMULATOR_CHECK)
+        return has_some
 
     def _stop_requested(self) -> bool:
         return self.files.exists(self.plan.stop_file)

@@ -179,6 +179,8 @@ class BatchedEnvRunner(RaisingEnvRunner):
     ) -> list[EpisodeChunks]:
         """Play, and return all completed transitions, at least one: the chunks of each policy.
 
+        Returns nothing if no simulator of the game is connected. What was played is in the next sample.
+
         Args:
             num_timesteps: Minimum number of actions; by default the configured fragment length in each environment.
             num_episodes: Minimum number of complete episodes, instead of `num_timesteps`.
@@ -203,10 +205,11 @@ class BatchedEnvRunner(RaisingEnvRunner):
                 play.restart()
             steps = play.metrics.steps + num_timesteps if num_timesteps is not None else 0
             episodes = play.metrics.episodes + (num_episodes or 0)
-            while play.metrics.steps < steps or play.metrics.episodes < episodes:
+            chunks: list[EpisodeChunks] = []
+            while play.metrics.steps < steps or play.metrics.episodes < episodes or not (chunks := self._chunks.cut()):
                 play.step(forward, explore)
-            while not (chunks := self._chunks.cut()):
-                play.step(forward, explore)
+                if play.is_alone:
+                    return []
         if not taught:
             return chunks
         assert self._teacher is not None, "the league has no teacher"

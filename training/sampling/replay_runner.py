@@ -33,7 +33,7 @@ class ReplayRunner(BatchedEnvRunner):
     def transitions(
         self, actions: int, exploration: float, opponents: Sequence[OpponentConfig] = ()
     ) -> tuple[int, dict[str, TransitionBlock]]:
-        """Play at least `actions` actions of all agents.
+        """Play at least `actions` actions of all agents, fewer if no simulator of the game is connected.
 
         Args:
             actions: Their minimum number.
@@ -54,6 +54,8 @@ class ReplayRunner(BatchedEnvRunner):
             before, forward = play.metrics.steps, partial(self._forward, self.module.forward_exploration)
             while play.metrics.steps < before + actions:
                 play.step(forward, explore=True)
+                if play.is_alone:
+                    break
         return play.metrics.steps - before, self._closed.cut()
 
     def sample_chunks(self, **kwargs: Any) -> list[EpisodeChunks]:

@@ -120,6 +120,12 @@ class SelfPlay:
         self._scores = OpponentScores(self._matchups.sides, self._scoring, self._stepping.num_envs)
         self.exchange(opponents)
 
+    @property
+    def is_alone(self) -> bool:
+        """Whether nothing has happened in the last step, since no simulator of the game is connected."""
+        turn = self._turn
+        return not (turn.batches or len(turn.finished) or len(turn.crashed))
+
     def log(self, metrics: MetricsLogger) -> None:
         """Log everything since the last call."""
         self.metrics.log(metrics)

@@ -58,7 +58,8 @@ class ExternalStepping(BatchedEnvironment):
 
     A turn contains the agents that have reported: those of slow simulators come in later turns. Episodes wait until a
     simulator is free. What is in progress when a connection ends is lost, and reported in `Turn.crashed`; the next
-    episodes of these environments start with the following step.
+    episodes of these environments start with the following step. In training, a turn is empty while no simulator is
+    connected, so that a run can end.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class ExternalStepping(BatchedEnvironment):
         """Open the gateway, and announce it in the registry while episodes are needed. agents: their spaces."""
         super().__init__(tuple(agents), num_envs)
         self._config, self._league = config, simulators.league
+        self._is_training = simulators.purpose == "training"
         self._alone_since = perf_counter()
         self._next_check = 0.0
         self._codec = MessageCodec(agents)
@@ -195,7 +197,7 @@ class ExternalStepping(BatchedEnvironment):
             self._gateway.send([(self._links[number], play(self._episodes[envs].tolist(), self._seeds[envs].tolist()))])
 
     def _turn(self) -> Turn:
-        """Wait until agents must act, or all environments are idle."""
+        """Wait until agents must act, or all environments are idle; in training for POLL if there is no simulator."""
         first: float | None = None
         while True:
             timeout = POLL
@@ -212,7 +214,7 @@ class ExternalStepping(BatchedEnvironment):
             try:
                 arrival = self._gateway.arrivals.get(timeout > 0, max(timeout, 0.0) or None)
             except Empty:
-                if first is not None:
+                if first is not None or (self._is_training and not self._links):
                     break
             else:
                 self._process(arrival)

@@ -45,6 +45,7 @@ from tests.conformance.stepping import assert_stepping_conforms
 from tests.support import simulators
 from tests.support.environments.lockstep import CONFIG, CONTESTANTS, INTERFACE, build_roster
 from tests.support.simulators import LEAGUE, NAME, VERSION, external, gateway, pettingzoo, simulating, stepping
+from tests.support.waiting import until
 
 BOARD = {"observation": np.zeros((3, 3, 2), np.int8), "action_mask": np.ones(9, np.int8)}
 
@@ -186,6 +187,14 @@ def sends_too_much(door: Gateway) -> None:
     opened, _ = started(door)
     opened._connection.send(b"\1\1" + bytes(17 * 2**20))
     until_refused(opened)
+
+
+def test_training_does_not_wait_for_the_first_simulator(opened: Registry) -> None:
+    """It could not be ended otherwise."""
+    with closing(stepping(opened, purpose="training")) as environment:
+        assert not environment.start(each_agent_alone(range(16), 2)).batches
+        with simulating(opened, STOCK):
+            until(lambda: environment.step({}).batches)
 
 
 def test_a_simulator_with_a_loop_of_its_own(
