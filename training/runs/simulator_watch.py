@@ -15,10 +15,10 @@ POLL = 0.5
 
 
 class SimulatorWatch(NotPickled, tune.Callback):
-    """Watches the gateways of a league during one attempt. say: prints a line."""
+    """Watches the gateways of a league during one attempt. say: prints a line. machines: of the cluster."""
 
-    def __init__(self, registry: Registry, league: str, say: Callable[[str], None]) -> None:
-        self._registry, self._league, self._say = registry, league, say
+    def __init__(self, registry: Registry, league: str, say: Callable[[str], None], machines: int = 1) -> None:
+        self._registry, self._league, self._say, self._machines = registry, league, say, machines
         self._urls: set[str] = set()
         self._simulators: int | None = None
         self._next_look = 0.0
@@ -39,6 +39,12 @@ class SimulatorWatch(NotPickled, tune.Callback):
                     f"Simulators of league {self._league} connect to the server, or here: {gateway.url} with the key"
                     f" {gateway.token}"
                 )
+                if self._machines > 1:
+                    self._say(
+                        f"The cluster has {self._machines} machines, and only the one of the run's runner reaches this"
+                        " address, which is on loopback: simulators elsewhere wait. Run a replica of the server on each"
+                        " machine, or train on the machine of the server without a cluster."
+                    )
         if not gateways or (simulators := sum(gateway.simulators for gateway in gateways)) == self._simulators:
             return
         if simulators:

@@ -25,6 +25,7 @@ from league.ray_cluster import (
     cluster_cpus,
     connected,
     lost_nodes,
+    node_addresses,
     node_ids,
     node_resources,
 )
@@ -369,7 +370,7 @@ class RunDriver:
         receiver = _ResultCallback(publisher, progress, self._reporter, self._callbacks, self._trackers)
         callbacks: list[tune.Callback] = [receiver, watch]
         if config.environment.external is not None:
-            callbacks.append(SimulatorWatch(self._registry, config.league, progress.say))
+            callbacks.append(SimulatorWatch(self._registry, config.league, progress.say, len(node_addresses())))
         tuner = tune.Tuner(
             tune.with_resources(Trial, placement(used, share)),
             param_space={

@@ -132,6 +132,13 @@ def test_changes_are_said_once(registry: Registry, monkeypatch: pytest.MonkeyPat
         assert lines == said
 
 
+def test_a_gateway_on_a_cluster_is_said_to_be_out_of_reach(registry: Registry) -> None:
+    lines: list[str] = []
+    registry.gateways.announce(TRAINING)
+    SimulatorWatch(registry, LEAGUE, lines.append, machines=3).on_step_begin()
+    assert "The cluster has 3 machines, and only the one of the run's runner reaches this address" in lines[1]
+
+
 def test_the_registry_is_not_asked_at_each_step(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(simulator_watch, "POLL", 3600.0)
     lines: list[str] = []
