@@ -10,7 +10,7 @@ import typer
 from league.errors import InvalidInput
 from league.refs import check_slug
 from policy_league.cli.options import AsJson, open_registry
-from policy_league.cli.output import emit, say, table
+from policy_league.cli.output import complain, emit, say, table
 
 if TYPE_CHECKING:
     from league.registry.storage.rows import KeyRow
@@ -19,8 +19,8 @@ app = typer.Typer(
     name="keys",
     no_args_is_help=True,
     help="Create, list and revoke API keys.\n\n"
-    "A key permits action requests, reading, evaluations or promotions. As soon as one key exists, every request needs"
-    " one. Replicas apply changes within a second.",
+    "A key permits action requests, reading, evaluations, promotions or simulators. As soon as one key exists, every"
+    " request needs one. Replicas apply changes within a second.",
 )
 
 DURATIONS = {"m": timedelta(minutes=1), "h": timedelta(hours=1), "d": timedelta(days=1), "w": timedelta(weeks=1)}
@@ -31,7 +31,8 @@ PERIODS = {"s": 1, "m": 60, "h": 3600}
 def create(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the key, recorded in histories as the actor.")],
     scopes: Annotated[
-        list[str], typer.Option("--scope", help="Permission: act, read, evaluate or promote. Can be repeated.")
+        list[str],
+        typer.Option("--scope", help="Permission: act, read, evaluate, promote or simulate. Can be repeated."),
     ],
     leagues: Annotated[
         list[str] | None,
@@ -45,7 +46,7 @@ def create(
 ) -> None:
     """Create an API key and print it. It cannot be shown again, as only its digest is stored.
 
-    Clients send it in the header `Authorization: Bearer plk_…`.
+    Clients send it in the header `Authorization: Bearer plk_…`. Only the key is printed to stdout.
     """
     key, token = open_registry().keys.create(
         name,
@@ -58,7 +59,7 @@ def create(
         emit(_document(key) | {"key": token})
         return
     say(token)
-    say(
+    complain(
         f"\nStore the key {name} now: it is not shown again. Clients send `Authorization: Bearer {token[:12]}_…`.\n"
         "From now on, servers require a key for every request, unless deploy.yaml sets require_keys to never."
     )

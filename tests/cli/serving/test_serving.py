@@ -29,10 +29,10 @@ def test_a_key_is_shown_once_listed_and_revoked(league: League, registry: Regist
     assert "No API keys" in league("keys", "list").out
     options = ("--scope", "act", "--scope", "read", "--rate", "600/m", "--expires", "30d")
     created = league("keys", "create", "lobby", *options)
-    token = created.out.splitlines()[0]
+    (token,) = created.out.splitlines()
     assert token.startswith("plk_")
-    assert "it is not shown again" in created.out
-    assert "require a key for every request" in created.out
+    assert "it is not shown again" in created.err
+    assert "require a key for every request" in created.err
     (key,) = league("keys", "list", "--json").json["keys"]
     assert (key["name"], key["scopes"], key["rate"], key["state"]) == ("lobby", ["act", "read"], 10, "valid")
     ends_in = datetime.fromisoformat(key["expires_at"]) - datetime.now(UTC)
