@@ -69,7 +69,8 @@ def test_a_game_is_played_back_step_by_step(tab: Tab, served: Served) -> None:
 
 @pytest.mark.e2e
 def test_a_search_version_analyses_a_recorded_game(tab: Tab, served: Served) -> None:
-    match = Ledger(served.registry).matches(league=SEARCHED)[0]
+    matches = Ledger(served.registry).matches(league=SEARCHED)
+    match = next(match for match in matches if f"{SEARCHED}@2" not in match.contestants)
     page = tab.open(f"/leagues/{SEARCHED}/matches/{match.schedule}/{match.position}/0")
     info, chart = page.locator(".game-info"), page.get_by_role("img", name=re.compile("Expected return of player_1"))
     expect(page.locator(".seek output")).to_have_text(re.compile("^0 of"))
@@ -85,9 +86,13 @@ def test_a_search_version_analyses_a_recorded_game(tab: Tab, served: Served) -> 
     expect(info).not_to_contain_text("expected return")
 
 
-def test_a_search_version_can_be_promoted(tab: Tab) -> None:
+def test_pages_show_what_a_search_costs(tab: Tab) -> None:
+    """The leaderboard, and the versions, where it can be promoted."""
+    searching = re.compile(r"search with @1, 40 simulations, puct, [\d.]+ ms")
+    page = tab.open(f"/leagues/{SEARCHED}")
+    expect(page.get_by_role("table", name="Leaderboard").get_by_role("row").filter(has_text=searching)).to_be_visible()
     page = tab.open(f"/leagues/{SEARCHED}/versions")
-    version = page.get_by_role("row").filter(has_text=re.compile(r"search with @1, 40 simulations, puct, [\d.]+ ms"))
+    version = page.get_by_role("row").filter(has_text=searching)
     expect(version.get_by_role("button", name=f"Promote {SEARCHED}@2")).to_be_visible()
 
 
@@ -97,6 +102,16 @@ def test_a_search_version_names_the_best_move(tab: Tab, served: Served) -> None:
     page.get_by_label("Analysis").select_option("2")
     expect(page.get_by_role("heading", name="Best move: ")).to_be_visible()
     expect(page.locator(".game-info")).to_contain_text("expected return")
+
+
+def test_a_search_version_explains_its_own_moves(tab: Tab, served: Served) -> None:
+    answer("GET", f"{tab.url}/v1/leagues/{SEARCHED}/playable")
+    page = tab.open(f"/leagues/{SEARCHED}/play#opponent={SEARCHED}@2&agent=player_2&seed=1&actions=")
+    expect(page.locator(".turn")).to_have_text(TURN)
+    page.get_by_label("Show the policy's probabilities").check()
+    move = page.locator(".move-log").get_by_role("listitem").filter(has_text="player_1 @2 plays").first
+    expect(move).to_contain_text(re.compile(r"expected return [−+-]?\d"))
+    expect(move.get_by_role("list", name="Probabilities")).to_contain_text("%")
 
 
 AS_SOON_AS_VISIBLE = """

@@ -17,6 +17,7 @@ from league.registry.storage.rows import Portion
 from league.search.policies import contestant, publish_search
 from league.settings import Storage
 from league.spaces import ACTION_MASK, OBSERVATION
+from policy_league_client import Client
 from policy_league_client.requests import ActionRequest, BatchActionRequest
 from policy_league_client.responses import parse_action_response, parse_batch_action_response
 from serve_app.live_versions.remote_search import MESSAGES, CallQueue, SearchClient
@@ -158,6 +159,24 @@ def test_a_deadline_ends_a_search_and_an_analysis_explains_it(served: tuple[Test
     row = replies.response(3)
     assert row.analysis is not None
     assert row.simulations == sum(row.analysis.visits)
+
+
+def test_the_client_requests_a_deadline_and_an_analysis(registry: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
+    server, _ = searching_server(registry, monkeypatch)
+    options = {"deadline_ms": 20, "analysis": True}
+    with (
+        Listening(server) as address,
+        Client(f"http://{address.http}", timeout=60) as client,
+        client.episode(f"{LEAGUE}@{SLOW}") as episode,
+    ):
+        response = client.act(f"{LEAGUE}@{SLOW}", BOARDS[1], **options)
+        episode.act(BOARDS[1], **options)
+    for reply in (response, episode.last):
+        assert reply is not None
+        assert reply.analysis is not None
+        assert sum(reply.analysis.visits) == reply.simulations
+        assert reply.analysis.line[0] == reply.action
+        assert reply.simulations < 10_000
 
 
 def test_what_cannot_be_searched_is_refused(registry: Registry, served: tuple[TestClient, LocalHandle]) -> None:

@@ -63,8 +63,8 @@ def leagues_of_every_page(home: Path) -> Iterator[Registry]:
             tictactoe.publish(registry, masked_mlp((3, 3, 2), 9), SEARCHED, value=value),
             registry.leagues.get(SEARCHED),
         )
-        publish_search(registry, base, row.config.environment, row.interface, "puct", SIMULATIONS)
-        evaluate(SEARCHED, [base.ref, "script:random"], registry=registry, blocks=1)
+        searching = publish_search(registry, base, row.config.environment, row.interface, "puct", SIMULATIONS)
+        evaluate(SEARCHED, [base.ref, searching.ref, "script:random"], registry=registry, blocks=1)
         evaluate(TEAM, ["script:random", "script:first"], registry=registry, blocks=2)
         registry.traffic.set(LEAGUE, canary=Portion(1, 0.05), shadow=Portion(2, 1.0), actor=HOSTILE, reason=HOSTILE)
         registry.versions.set_note(CheckpointRef(LEAGUE, 2), HOSTILE, actor=HOSTILE)
