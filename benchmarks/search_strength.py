@@ -1,14 +1,15 @@
 """How much stronger is a version of connect four with a search?
 
-Plays the champion of connect_four in LEAGUE_HOME, or the given version, with a search (PUCT) against itself without
-one and against scripts: greedy, from random openings of four plies, on both sides equally. A score counts a draw as
-half a win; bounds are the lower limits of 95 % intervals over matches of two games. Against `mcts_1000`, the number of
-simulations is that of the same processor time per move, measured before in single positions. Then the late positions
-of `decisive_positions`, and games of the champion of tictactoe against perfect play, from the empty board. Nothing is
-written to the ledger.
+Plays the champion of connect_four in LEAGUE_HOME, or the given version, with a search against itself without one
+(part itself) and against scripts (minimax, mcts): greedy, from random openings of four plies, on both sides equally. A
+score counts a draw as half a win; bounds are the lower limits of 95 % intervals over matches of two games. Against
+`mcts_1000`, the number of simulations is that of the same processor time per move, measured before in single positions.
+late_positions are those of `decisive_positions`; tictactoe plays games of the champion of tictactoe against perfect
+play, from the empty board. Nothing is written to the ledger.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from statistics import fmean, stdev
 from time import process_time
 from typing import Annotated
@@ -18,7 +19,7 @@ import typer
 from scipy.stats import binomtest
 
 from benchmarks.decisive_positions import POSITIONS, decisive_positions
-from benchmarks.harness import Quick, Target
+from benchmarks.harness import Parts, Quick, Target, chosen
 from benchmarks.search import positions
 from evaluation.matches.worker import MatchWorker
 from evaluation.schedules.builders import round_robin
@@ -29,6 +30,7 @@ from league.policies.policy import Policy
 from league.policies.scripted import script
 from league.refs import CheckpointRef
 from league.registry.registry import Registry
+from league.registry.storage.manifest import SearchRule
 from league.search.policies import SearchPolicy, search_policies
 
 GAMES, OPENING_PLIES, SIMULATIONS = 1000, 4, 100
@@ -43,8 +45,8 @@ SEED = 0
 class Arena:
     """Matches of a version with a search. opening_plies: random moves at the start."""
 
-    def __init__(self, ref: str, registry: Registry, opening_plies: int = OPENING_PLIES) -> None:
-        self._registry, self._base = registry, registry.versions.resolve(CheckpointRef.parse(ref))
+    def __init__(self, ref: str, registry: Registry, rule: SearchRule, opening_plies: int = OPENING_PLIES) -> None:
+        self._rule, self._registry, self._base = rule, registry, registry.versions.resolve(CheckpointRef.parse(ref))
         row = registry.leagues.get(self._base.league)
         play = row.config.play.model_copy(update={"opening_plies": opening_plies})
         self._config, self.interface = row.config.model_copy(update={"play": play}), row.interface
@@ -58,7 +60,7 @@ class Arena:
     def search(self, simulations: int) -> Mapping[str, SearchPolicy]:
         """The policies of the version with a search, by id."""
         environment = self._config.environment
-        return search_policies(self._base, "puct", simulations, self._registry, self.interface, environment)
+        return search_policies(self._base, self._rule, simulations, self._registry, self.interface, environment)
 
     def scores(self, simulations: int, opponent: str, games: int) -> list[float]:
         """Mean score of the version with a search in each match against an opponent."""
@@ -84,38 +86,90 @@ def milliseconds(policy: Policy) -> float:
     return 1000 * (process_time() - began) / TIMED
 
 
-def main(
-    ref: Annotated[str, typer.Argument()] = "connect_four@champion",
-    quick: Quick = False,
-    small: Annotated[str, typer.Option(help="the version of tic-tac-toe")] = "tictactoe@champion",
-) -> Iterator[Target]:
-    """Play, solve and count."""
-    scale = 10 if quick else 1
-    registry = Registry.open()
-    arena, games, number = Arena(ref, registry), GAMES // scale, POSITIONS // scale
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What the parts measure. scale: divides the numbers of games and positions."""
+
+    registry: Registry
+    rule: SearchRule
+    ref: str
+    small: str
+    scale: int
+
+    def arena(self) -> Arena:
+        """Matches of the version of connect four."""
+        return Arena(self.ref, self.registry, self.rule)
+
+
+def itself(setting: Setting) -> Iterator[Target]:
+    """Against the version without a search."""
+    arena, games = setting.arena(), GAMES // setting.scale
     score, low = arena.score(SIMULATIONS, arena.base, games)
-    note = f"{SIMULATIONS} simulations, {games} games, score {score:.1%}"
+    note = f"{setting.rule}, {SIMULATIONS} simulations, {games} games, score {score:.1%}"
     yield Target("Elo, lower bound", round(elo_of(low)), "Elo", at_least=ELO, peer="itself", note=note)
-    spaces = arena.interface.of_policy(arena.interface.policy_ids[0])
+
+
+def minimax(setting: Setting) -> Iterator[Target]:
+    """Against `minimax_4`."""
+    arena, games = setting.arena(), GAMES // setting.scale
     score, low = arena.score(SIMULATIONS, "script:minimax_4", games)
-    note = f"{SIMULATIONS} simulations, {games} games, score {score:.1%}"
+    note = f"{setting.rule}, {SIMULATIONS} simulations, {games} games, score {score:.1%}"
     yield Target("score, lower bound", round(100 * low, 2), "%", at_least=AGAINST_MINIMAX, peer="minimax_4", note=note)
+
+
+def mcts(setting: Setting) -> Iterator[Target]:
+    """Against `mcts_1000`, at equal processor time per move."""
+    arena, games = setting.arena(), GAMES // setting.scale
+    spaces = arena.interface.of_policy(arena.interface.policy_ids[0])
     allowed = milliseconds(script("mcts_1000", spaces.observation, spaces.action))
     few, many = (milliseconds(next(iter(arena.search(count).values()))) for count in (SIMULATIONS, 4 * SIMULATIONS))
     simulations = round(SIMULATIONS + 3 * SIMULATIONS * (allowed - few) / (many - few))
     score, low = arena.score(simulations, "script:mcts_1000", games)
-    note = f"{simulations} simulations in {allowed:.1f} ms, {games} games, score {score:.1%}"
+    note = f"{setting.rule}, {simulations} simulations in {allowed:.1f} ms, {games} games, score {score:.1%}"
     yield Target("score, lower bound", round(100 * low, 2), "%", at_least=AGAINST_MCTS, peer="mcts_1000", note=note)
+
+
+def late_positions(setting: Setting) -> Iterator[Target]:
+    """In the positions of `decisive_positions`."""
+    arena, number = setting.arena(), POSITIONS // setting.scale
+    spaces = arena.interface.of_policy(arena.interface.policy_ids[0])
     late = decisive_positions(number, script("one_ply", spaces.observation, spaces.action))
     kept = late.kept(next(iter(arena.search(LATE_SIMULATIONS).values())))
     bound = binomtest(int(kept.sum()), number).proportion_ci(0.95, "wilson").low
-    plain = late.kept(load(arena.base, registry=registry)).mean()
-    note = f"{LATE_SIMULATIONS} simulations, {number} positions; {plain:.1%} without a search"
+    plain = late.kept(load(arena.base, registry=setting.registry)).mean()
+    note = f"{setting.rule}, {LATE_SIMULATIONS} simulations, {number} positions; {plain:.1%} without a search"
     name = "late outcomes kept"
     yield Target(name, round(100 * kept.mean(), 2), "%", at_least=KEPT, note=note)
     yield Target(f"{name}, lower bound", round(100 * bound, 2), "%", at_least=KEPT_LOW, note=note)
-    games = TICTACTOE_GAMES // scale
-    scores = Arena(small, registry, opening_plies=0).scores(TICTACTOE_SIMULATIONS, "script:solver", games)
-    note = f"{TICTACTOE_SIMULATIONS} simulations, {games} games"
+
+
+def tictactoe(setting: Setting) -> Iterator[Target]:
+    """Tic-tac-toe from the empty board, against perfect play."""
+    games = TICTACTOE_GAMES // setting.scale
+    arena = Arena(setting.small, setting.registry, setting.rule, opening_plies=0)
+    scores = arena.scores(TICTACTOE_SIMULATIONS, "script:solver", games)
+    note = f"{setting.rule}, {TICTACTOE_SIMULATIONS} simulations, {games} games"
     lost = sum(score < 0.5 for score in scores)
     yield Target("tic-tac-toe losses", lost, at_most=0, peer="the solver", note=note)
+
+
+PARTS: dict[str, Callable[[Setting], Iterator[Target]]] = {
+    "itself": itself,
+    "minimax": minimax,
+    "mcts": mcts,
+    "late_positions": late_positions,
+    "tictactoe": tictactoe,
+}
+
+
+def main(
+    parts: Parts = None,
+    quick: Quick = False,
+    rule: SearchRule = "puct",
+    ref: Annotated[str, typer.Option(help="the version of connect four")] = "connect_four@champion",
+    small: Annotated[str, typer.Option(help="the version of tic-tac-toe")] = "tictactoe@champion",
+) -> Iterator[Target]:
+    """Play, solve and count."""
+    setting = Setting(Registry.open(), rule, ref, small, 10 if quick else 1)
+    for part in chosen(parts, PARTS).values():
+        yield from part(setting)
