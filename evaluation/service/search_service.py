@@ -104,7 +104,8 @@ class SearchService:
             with_lines: Whether to return the moves that the search expects.
 
         Returns:
-            The fields of SearchResult, and `ns`, the processor time; or `{"code", "message"}` of an error.
+            The fields of SearchResult, and `ns`, the processor time, and `seconds`, since the call arrived; or
+            `{"code", "message"}` of an error.
         """
         current_time = time.monotonic()
         deadline = math.inf if seconds is None else current_time + seconds
@@ -113,7 +114,7 @@ class SearchService:
         self._waiting.append(_Call(version, policy, observations, deadline, current_time + limit, with_lines, result))
         if self._work is None or self._work.done():
             self._work = asyncio.create_task(self._answer_all())
-        return await result
+        return await result | {"seconds": time.monotonic() - current_time}
 
     async def _answer_all(self) -> None:
         loop = asyncio.get_running_loop()

@@ -5,12 +5,14 @@ that is called by handle.
 import asyncio
 import concurrent.futures
 import math
+from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from copy import copy
 from dataclasses import dataclass, field
 from functools import partial
+from statistics import median
 from time import monotonic
 from typing import Any, Self
 from weakref import WeakSet
@@ -36,6 +38,8 @@ SHARED_ROWS = 64
 """Positions of a call that shares a message, at most: the others of a message wait for its last search."""
 PAUSE = 0.1
 """Seconds until a call is repeated whose process has ended."""
+LATENCIES = 9
+"""Latest messages whose median latency is expected of the next ones: the first ones wait for a process that starts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +72,13 @@ class SearchClient:
         self._policies: WeakSet[RemoteSearch] = WeakSet()
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_used = asyncio.Event()
+        self._latencies = deque([0.0], LATENCIES)
         self.threads = ThreadPoolExecutor(SEARCHES, thread_name_prefix="searches")
+
+    @property
+    def latency(self) -> float:
+        """Expected seconds for which a message and its response are under way, by which searches must end earlier."""
+        return median(self._latencies)
 
     @asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
@@ -142,13 +152,23 @@ class SearchClient:
                 call.response.add_done_callback(partial(_end_unless_awaited, task, calls))
 
     async def _message(self, queue: CallQueue, calls: list[_Call]) -> None:
+        sent_at = 0.0
+
+        def arguments() -> tuple[list[tuple[object, ...]]]:
+            nonlocal sent_at
+            sent_at = monotonic()
+            return ([call.arguments() for call in calls],)
+
         try:
-            responses = await self._call("searches", lambda: ([call.arguments() for call in calls],))
+            responses = await self._call("searches", arguments)
         except Exception as error:
             for call in calls:
                 if not call.response.done():
                     call.response.set_exception(error)
         else:
+            latency = monotonic() - sent_at - max(response.get("seconds", math.inf) for response in responses)
+            if latency >= 0:  # a process of an earlier release does not tell its part
+                self._latencies.append(latency)
             for call, response in zip(calls, responses, strict=True):
                 if not call.response.done():  # nobody waits any more
                     call.response.set_result(response)
@@ -231,7 +251,8 @@ class RemoteSearch:
         expiry = monotonic() + self._timeout
 
         def arguments() -> tuple[object, ...]:
-            seconds = None if self._deadline == math.inf else max(0.0, self._deadline - monotonic())
+            remaining = self._deadline - monotonic() - self._client.latency
+            seconds = None if remaining == math.inf else max(0.0, remaining)
             limit = max(0.0, expiry - monotonic())
             return *self._version, self._policy, dict(observations), seconds, limit, self._with_lines
 

@@ -3,6 +3,8 @@
 import asyncio
 from collections.abc import Awaitable, Iterator
 from pathlib import Path
+from time import monotonic
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,11 +18,11 @@ from league.registry.registry import Registry
 from league.registry.storage.rows import Portion
 from league.search.policies import contestant, publish_search
 from league.settings import Storage
-from league.spaces import ACTION_MASK, OBSERVATION
+from league.spaces import ACTION_MASK, OBSERVATION, Discrete
 from policy_league_client import Client
 from policy_league_client.requests import ActionRequest, BatchActionRequest
 from policy_league_client.responses import parse_action_response, parse_batch_action_response
-from serve_app.live_versions.remote_search import MESSAGES, CallQueue, SearchClient
+from serve_app.live_versions.remote_search import LATENCIES, MESSAGES, CallQueue, RemoteSearch, SearchClient
 from tests.support.clients.triton import Triton
 from tests.support.leagues import tictactoe
 from tests.support.leagues.tictactoe import LEAGUE
@@ -227,7 +229,7 @@ class HeldService:
         except asyncio.CancelledError:
             self.ended += 1
             raise
-        return [{"call": call[0]} for call in calls]
+        return [{"call": call[0], "seconds": 0.0} for call in calls]
 
 
 @pytest.mark.anyio
@@ -258,8 +260,32 @@ async def test_abandoned_calls_are_not_sent_and_their_message_ends() -> None:
             await asyncio.sleep(0)
         service.released.set()
         assert (await sent[1])["call"] == "sent"
-        assert await asyncio.wrap_future(client.search(queue, lambda: ("next",), 60.0)) == {"call": "next"}
+        assert await asyncio.wrap_future(client.search(queue, lambda: ("next",), 60.0)) == {
+            "call": "next",
+            "seconds": 0.0,
+        }
     assert [calls for calls in service.messages if ("late",) in calls] == []
+
+
+@pytest.mark.anyio
+async def test_searches_end_earlier_by_the_time_that_messages_take() -> None:
+    granted: list[float] = []
+
+    async def answer(calls: list[tuple[Any, ...]]) -> list[dict[str, Any]]:
+        granted.extend(call[5] for call in calls)
+        await asyncio.sleep(0.05)
+        return [{"code": "graph_timeout", "message": "", "seconds": 0.01} for _ in calls]
+
+    handle = SimpleNamespace(searches=SimpleNamespace(remote=answer))
+    client = SearchClient(handle, 1)  # type: ignore[arg-type]
+    version = SimpleNamespace(league=LEAGUE, number=SEARCH, sha256="")
+    policy = RemoteSearch(client, version, "shared", Discrete(n=9), 60.0)  # type: ignore[arg-type]
+    async with client.running():
+        for _ in range(LATENCIES + 1):
+            with pytest.raises(GraphTimeout):
+                await asyncio.to_thread(policy.bounded(monotonic() + 30).act, {"observation": np.zeros((1, 2))})
+    assert granted[0] > granted[-1]
+    assert granted[-1] <= 30 - 0.04
 
 
 async def until_sent(service: HeldService, number: int) -> None:
