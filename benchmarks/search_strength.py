@@ -57,6 +57,11 @@ class Arena:
         """The version without a search."""
         return self._base.ref
 
+    @property
+    def described(self) -> str:
+        """How long the version was trained."""
+        return f"{self._base.steps:,} steps"
+
     def search(self, simulations: int) -> Mapping[str, SearchPolicy]:
         """The policies of the version with a search, by id."""
         environment = self._config.environment
@@ -105,16 +110,17 @@ def itself(setting: Setting) -> Iterator[Target]:
     """Against the version without a search."""
     arena, games = setting.arena(), GAMES // setting.scale
     score, low = arena.score(SIMULATIONS, arena.base, games)
-    note = f"{setting.rule}, {SIMULATIONS} simulations, {games} games, score {score:.1%}"
-    yield Target("Elo, lower bound", round(elo_of(low)), "Elo", at_least=ELO, peer="itself", note=note)
+    note = f"{arena.described}, {SIMULATIONS} simulations, {games} games, score {score:.1%}"
+    yield Target(f"{setting.rule}: Elo, lower bound", round(elo_of(low)), "Elo", at_least=ELO, peer="itself", note=note)
 
 
 def minimax(setting: Setting) -> Iterator[Target]:
     """Against `minimax_4`."""
     arena, games = setting.arena(), GAMES // setting.scale
     score, low = arena.score(SIMULATIONS, "script:minimax_4", games)
-    note = f"{setting.rule}, {SIMULATIONS} simulations, {games} games, score {score:.1%}"
-    yield Target("score, lower bound", round(100 * low, 2), "%", at_least=AGAINST_MINIMAX, peer="minimax_4", note=note)
+    note = f"{arena.described}, {SIMULATIONS} simulations, {games} games, score {score:.1%}"
+    name = f"{setting.rule}: score, lower bound"
+    yield Target(name, round(100 * low, 2), "%", at_least=AGAINST_MINIMAX, peer="minimax_4", note=note)
 
 
 def mcts(setting: Setting) -> Iterator[Target]:
@@ -125,8 +131,9 @@ def mcts(setting: Setting) -> Iterator[Target]:
     few, many = (milliseconds(next(iter(arena.search(count).values()))) for count in (SIMULATIONS, 4 * SIMULATIONS))
     simulations = round(SIMULATIONS + 3 * SIMULATIONS * (allowed - few) / (many - few))
     score, low = arena.score(simulations, "script:mcts_1000", games)
-    note = f"{setting.rule}, {simulations} simulations in {allowed:.1f} ms, {games} games, score {score:.1%}"
-    yield Target("score, lower bound", round(100 * low, 2), "%", at_least=AGAINST_MCTS, peer="mcts_1000", note=note)
+    note = f"{arena.described}, {simulations} simulations in {allowed:.1f} ms, {games} games, score {score:.1%}"
+    name = f"{setting.rule}: score, lower bound"
+    yield Target(name, round(100 * low, 2), "%", at_least=AGAINST_MCTS, peer="mcts_1000", note=note)
 
 
 def late_positions(setting: Setting) -> Iterator[Target]:
@@ -137,8 +144,8 @@ def late_positions(setting: Setting) -> Iterator[Target]:
     kept = late.kept(next(iter(arena.search(LATE_SIMULATIONS).values())))
     bound = binomtest(int(kept.sum()), number).proportion_ci(0.95, "wilson").low
     plain = late.kept(load(arena.base, registry=setting.registry)).mean()
-    note = f"{setting.rule}, {LATE_SIMULATIONS} simulations, {number} positions; {plain:.1%} without a search"
-    name = "late outcomes kept"
+    note = f"{arena.described}, {LATE_SIMULATIONS} simulations, {number} positions; {plain:.1%} without a search"
+    name = f"{setting.rule}: late outcomes kept"
     yield Target(name, round(100 * kept.mean(), 2), "%", at_least=KEPT, note=note)
     yield Target(f"{name}, lower bound", round(100 * bound, 2), "%", at_least=KEPT_LOW, note=note)
 
@@ -148,9 +155,9 @@ def tictactoe(setting: Setting) -> Iterator[Target]:
     games = TICTACTOE_GAMES // setting.scale
     arena = Arena(setting.small, setting.registry, setting.rule, opening_plies=0)
     scores = arena.scores(TICTACTOE_SIMULATIONS, "script:solver", games)
-    note = f"{setting.rule}, {TICTACTOE_SIMULATIONS} simulations, {games} games"
+    note = f"{arena.described}, {TICTACTOE_SIMULATIONS} simulations, {games} games"
     lost = sum(score < 0.5 for score in scores)
-    yield Target("tic-tac-toe losses", lost, at_most=0, peer="the solver", note=note)
+    yield Target(f"{setting.rule}: tic-tac-toe losses", lost, at_most=0, peer="the solver", note=note)
 
 
 PARTS: dict[str, Callable[[Setting], Iterator[Target]]] = {
