@@ -28,7 +28,7 @@ from league.registry.storage.rows import VersionRow
 from league.search.gumbel import SequentialHalving
 from league.search.puct import PUCT
 from league.search.requirements import searchable
-from league.search.rules import Estimates, Rule
+from league.search.rules import ILLEGAL, Estimates, Rule
 from league.search.search import Search, SearchResult
 from league.search.searched_actions import SearchedActions
 from league.spaces import Discrete
@@ -125,9 +125,10 @@ class SearchPolicy:
             raise
         except Exception as error:
             raise ArtifactCorrupt(f"ONNX Runtime cannot run the value graph: {one_line(error)}") from error
+        logits = np.maximum(logits, ILLEGAL)  # a graph may mask by -inf
         # Faster than `any` and `clip` for a few rows.
-        if np.count_nonzero(np.isnan(value)) or np.count_nonzero(np.isnan(logits)):
-            raise ArtifactCorrupt("the value graph returns NaN")
+        if np.count_nonzero(np.isnan(value)) or np.count_nonzero(np.isfinite(logits)) < logits.size:
+            raise ArtifactCorrupt("the value graph returns NaN or infinity")
         value = np.minimum(np.maximum(value, -1), 1)
         return Estimates(logits, value[:, np.newaxis] * SIGNS.take(rows.agents, axis=0))
 

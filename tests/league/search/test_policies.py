@@ -65,7 +65,7 @@ def test_a_network_that_returns_nan_is_corrupt(name: str) -> None:
     (weights,) = (weights for weights in model.graph.initializer if weights.name == name)
     weights.CopyFrom(onnx.numpy_helper.from_array(np.full(weights.dims, np.nan, np.float32), name))
     policy = SearchPolicy(TicTacToe, model.SerializeToString(), Discrete(n=9), "puct", 8)
-    with pytest.raises(ArtifactCorrupt, match="the value graph returns NaN"):
+    with pytest.raises(ArtifactCorrupt, match="the value graph returns NaN or infinity"):
         policy.search({"observation": np.zeros((1, 3, 3, 2), np.int8), "action_mask": np.ones((1, 9), np.int8)})
 
 
