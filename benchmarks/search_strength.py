@@ -116,24 +116,25 @@ def itself(setting: Setting) -> Iterator[Target]:
 
 def minimax(setting: Setting) -> Iterator[Target]:
     """Against `minimax_4`."""
-    arena, games = setting.arena(), GAMES // setting.scale
-    score, low = arena.score(SIMULATIONS, "script:minimax_4", games)
-    note = f"{arena.described}, {SIMULATIONS} simulations, {games} games, score {score:.1%}"
-    name = f"{setting.rule}: score, lower bound"
-    yield Target(name, round(100 * low, 2), "%", at_least=AGAINST_MINIMAX, peer="minimax_4", note=note)
+    yield _against("minimax_4", setting, SIMULATIONS, "", AGAINST_MINIMAX)
 
 
 def mcts(setting: Setting) -> Iterator[Target]:
     """Against `mcts_1000`, at equal processor time per move."""
-    arena, games = setting.arena(), GAMES // setting.scale
+    arena = setting.arena()
     spaces = arena.interface.of_policy(arena.interface.policy_ids[0])
     allowed = milliseconds(script("mcts_1000", spaces.observation, spaces.action))
     few, many = (milliseconds(next(iter(arena.search(count).values()))) for count in (SIMULATIONS, 4 * SIMULATIONS))
     simulations = round(SIMULATIONS + 3 * SIMULATIONS * (allowed - few) / (many - few))
-    score, low = arena.score(simulations, "script:mcts_1000", games)
-    note = f"{arena.described}, {simulations} simulations in {allowed:.1f} ms, {games} games, score {score:.1%}"
+    yield _against("mcts_1000", setting, simulations, f" in {allowed:.1f} ms", AGAINST_MCTS)
+
+
+def _against(opponent: str, setting: Setting, simulations: int, time: str, at_least: float) -> Target:
+    arena, games = setting.arena(), GAMES // setting.scale
+    score, low = arena.score(simulations, f"script:{opponent}", games)
+    note = f"{arena.described}, {simulations} simulations{time}, {games} games, score {score:.1%}"
     name = f"{setting.rule}: score, lower bound"
-    yield Target(name, round(100 * low, 2), "%", at_least=AGAINST_MCTS, peer="mcts_1000", note=note)
+    return Target(name, round(100 * low, 2), "%", at_least=at_least, peer=opponent, note=note)
 
 
 def late_positions(setting: Setting) -> Iterator[Target]:

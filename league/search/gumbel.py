@@ -59,7 +59,7 @@ class SequentialHalving:
 
     def score(self, node: Node, root: int | None, number: int) -> Score:
         """See Rule."""
-        logits, visits, total = _improved_logits(node), node.visits, 1 + node.total_visits
+        logits, visits, total = _improved_logits_of(node), node.visits, 1 + node.total_visits
         if root is not None:
             noise = self._noise[root].tolist()
             expected_visits, times = self._visits[root, number], self._times[root, number]
@@ -95,7 +95,7 @@ def improved_logits(nodes: Nodes) -> NDArray[np.float64]:
     return nodes.logits + (VISIT_OFFSET + row_maxima(nodes.visits)) / 2 * (1 + values)
 
 
-def _improved_logits(node: Node) -> list[float]:
+def _improved_logits_of(node: Node) -> list[float]:
     """The same as `improved_logits` for one node."""
     visits, sums, total = node.visits, node.sums, node.total_visits
     mixed, scale = node.value, (VISIT_OFFSET + max(visits)) / 2

@@ -13,7 +13,6 @@ ILLEGAL = -1e9
 """Logit of an illegal action."""
 SCALE = 2.0**24
 """Scores are compared as integers, multiplied by this: equal ones stay equal when they are computed in another way."""
-
 SHARE = 4
 """A round has at most a SHARE-th of the simulations before it, or one: while a tree is small, each result changes where
 to look next."""

@@ -7,7 +7,6 @@ on the machine's speed.
 """
 
 import json
-import logging
 import math
 import time
 from collections import Counter
@@ -45,8 +44,6 @@ from training.rllib_compat import wait_for_runners
 from training.runs.checkpoint_digests import write_digests
 from training.runs.driver_files import DriverFiles, DriverMachine
 from training.sampling.play_metrics import PlayedEpisodes
-
-logger = logging.getLogger(__name__)
 
 REPORT_SECONDS = 2.0
 """Interval between a trial's reports, in seconds."""
@@ -124,7 +121,6 @@ class Trial(tune.Trainable):
         self.registry = Registry.open(self.plan.storage, create=False) if is_external else None
         if self.registry is not None:
             self._opened.callback(self.registry.close)
-        self._is_waiting = False
         start = self.plan.start
         checkpoint = None if start.checkpoint is None else self.files.fetch(start.checkpoint)
         self.algorithm = build_algorithm(self.league, self.interface, checkpoint, self.plan.cpus, self.plan.storage)
@@ -231,16 +227,12 @@ class Trial(tune.Trainable):
 
     def _has_simulators(self, registry: Registry) -> bool:
         """Whether simulators are connected. Waiting for them is no part of the run's minutes."""
-        has_some = False
         with suppress(StorageError):
             gateways = registry.gateways.open(self.league.league)
-            has_some = any(gateway.simulators and not gateway.is_evaluation for gateway in gateways)
-        if self._is_waiting == has_some:
-            logger.warning("%s", "A simulator is connected." if has_some else "No simulator is connected: waiting.")
-            self._is_waiting = not has_some
-        if not has_some:
-            time.sleep(SIMULATOR_CHECK)
-        return has_some
+            if any(gateway.simulators and not gateway.is_evaluation for gateway in gateways):
+                return True
+        time.sleep(SIMULATOR_CHECK)
+        return False
 
     def _stop_requested(self) -> bool:
         return self.files.exists(self.plan.stop_file)

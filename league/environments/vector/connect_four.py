@@ -15,6 +15,7 @@ STRIDE = ROWS + 1
 DIRECTIONS = np.array([1, STRIDE - 1, STRIDE, STRIDE + 1], dtype=np.uint64)[:, np.newaxis]
 """Distances between neighbouring bits of a vertical line, of both diagonals and of a horizontal line, (4, 1)."""
 TWICE = 2 * DIRECTIONS
+"""From a pair of pieces to the other pair of a line of four."""
 
 BITS = np.left_shift(np.uint64(1), np.arange(COLUMNS * STRIDE, dtype=np.uint64)).reshape(COLUMNS, STRIDE).T[:ROWS]
 BITS = BITS[..., np.newaxis]
